@@ -212,9 +212,6 @@ class Diffusion(Inpainter, torch.nn.Module):
     def needs_confidence(self) -> bool:
         return True
 
-    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
-        raise NotImplementedError("a generator needs whole frames: call fill")
-
     def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         """Fill rendered frames; ``frames`` hold their source images.
 

@@ -8,7 +8,7 @@ column, so that holes have the detail of their border near it. Unseen parts of o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -20,7 +20,7 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.inpaint.inpainter import GREY, Inpainter, Tensors
+from arbiview_aug.inpaint.inpainter import GREY, Inpainter
 from arbiview_aug.render.plan import Paint
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
@@ -55,18 +55,13 @@ class Continue(Inpainter):
     needs_layers: ClassVar[bool] = True
     only_mean: ClassVar[bool] = False
 
-    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
-        return fill_holes([view.clone() for view in views], [~hole for hole in holes], only_mean=self.only_mean)
-
     def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         """Fill rendered frames, own car included, in place where possible."""
         filled = []
         for frame in rendered:
-            plans = frame.layers, frame.paint, frame.road, frame.rig
-            images = fill_holes(frame.images, list(frame.coverage), *plans, only_mean=self.only_mean)
             seen = frame.coverage
             holes = ~seen if isinstance(seen, torch.Tensor) else [~covered for covered in seen]
-            filled.append(replace(frame, images=images, generated=holes))
+            filled.append(replace(frame, images=fill_holes(frame, self.only_mean), generated=holes))
         return filled
 
 
@@ -78,42 +73,26 @@ class Mean(Continue):
     only_mean = True
 
 
-def fill_holes(
-    views: Sequence[torch.Tensor],
-    coverage: Sequence[torch.Tensor],
-    layers: Sequence[npt.NDArray[np.uint8] | None] = (),
-    paint: Sequence[Paint | None] = (),
-    road: Sequence[BoolArray | None] = (),
-    cameras: Iterable[Camera] | None = None,
-    *,
-    only_mean: bool = False,
-) -> list[torch.Tensor]:
-    """Fill uncovered pixels; covered ones are unchanged and keep their gradients.
+def fill_holes(frame: Views, only_mean: bool = False) -> list[torch.Tensor]:
+    """Fill the uncovered pixels of a frame's images; covered ones are unchanged and keep their gradients.
 
-    Args:
-        views: M views (3, h, w), uint8 or float in [0, 1], black where uncovered. Views on the CPU without
-            gradients are modified.
-        coverage: (h, w) bool of each.
-        layers: (h, w) uint8 of each as in ``ViewPlan``, or None: all uncovered pixels lie outside the images.
-        paint: Colours of each as in ``ViewPlan``, or None.
-        road: Road nodes of each as in ``ViewPlan``, or None: the road reaches to the horizon.
-        cameras: Cameras of the views; None if unknown: verticals are columns, and there is no road.
-        only_mean: Set all to the mean colour of the frame's covered pixels. By default background continues background,
-            sides of objects continue objects, and tops are painted in their objects' colours.
+    Background continues background, sides of objects continue objects, and tops are painted in their objects' colours;
+    with ``only_mean`` all take the mean colour of the frame's covered pixels. Without ``layers`` of a view, all of its
+    holes lie outside the sources' images; without ``road``, it reaches to the horizon. Images on the CPU without
+    gradients are modified.
     """
     from arbiview_aug.inpaint.kernels import fill_background
     from arbiview_aug.render.paint_kernels import paint as paint_parts
 
-    seen = [mask.cpu().numpy() for mask in coverage]
+    seen = [mask.cpu().numpy() for mask in frame.coverage]
     if all(mask.all() for mask in seen):
-        return list(views)
-    arrays = [_as_array(view) for view in views]
-    needs_mean = only_mean or not all(of_view.any() for of_view in seen)
+        return list(frame.images)
+    arrays, none = [_as_array(view) for view in frame.images], [None] * len(seen)
+    needs_mean = only_mean or not all(mask.any() for mask in seen)
     mean = mean_colour(arrays, seen) if needs_mean else np.zeros(3, np.float32)
-    none = [None] * len(arrays)
-    colours = None if only_mean else object_colours(arrays, paint or none)
-    inputs = zip(arrays, seen, layers or none, paint or none, road or none, cameras or none, strict=True)
-    for view, known, layer, objects, on_road, camera in inputs:
+    colours = None if only_mean else object_colours(arrays, frame.paint or none)
+    plans = zip(frame.layers or none, frame.paint or none, frame.road or none, frame.rig, strict=True)
+    for view, known, (layer, objects, on_road, camera) in zip(arrays, seen, plans, strict=True):
         if known.all():
             continue
         rounding = 0.5 if view.dtype == np.uint8 else 0.0
@@ -125,14 +104,14 @@ def fill_holes(
         divisors = (n for n in range(most // 2 + 1, most + 1) if not any(length % n for length in known.shape))
         cell = max(divisors, default=most)  # preferably cells fill the view
         layer = np.zeros(known.shape, np.uint8) if layer is None else layer
-        on_road = _road_below_horizon(camera, known.shape) if on_road is None else on_road
+        on_road = _road_below_horizon(camera) if on_road is None else on_road
         lines = _line_directions(camera), REACH * np.float32(side / cell)
         fill_background(view, known, layer, on_road, *lines, mean, cell, rounding)
         if objects is not None:
             parts = objects.pixel, objects.part, objects.nearest, colours
             paint_parts(*parts, known, SIDE_REACH * side, rounding, view.reshape(3, -1))
     filled = []
-    for array, original, covered in zip(map(torch.from_numpy, arrays), views, coverage, strict=True):
+    for array, original, covered in zip(map(torch.from_numpy, arrays), frame.images, frame.coverage, strict=True):
         is_in_place = array.data_ptr() == original.data_ptr()
         pixels = array.to(original.device, original.dtype)
         filled.append(original if is_in_place else torch.where(covered, original, pixels))
@@ -166,10 +145,8 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
 
 # --- one view -------------------------------------------------------------------------------------------------------
 @lru_cache(32)  # the cameras of a rig serve every frame
-def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
+def _line_directions(camera: Camera) -> npt.NDArray[np.float32]:
     """Image directions (2, 2, n, n), x and y, of lines along the heading and of vertical lines, for kernels."""
-    if camera is None:
-        return np.array([(0, 0), (0, 1)], np.float32)[..., None, None].repeat(2, 2).repeat(2, 3)
     if camera.is_rectilinear:
         ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T[..., None, None]  # vanishing points, homogeneous
         return np.asarray(ends[:, :2] - ends[:, 2:] * np.moveaxis(_places(camera.size, 2), -1, 0), np.float32)
@@ -185,11 +162,9 @@ def _places(size: tuple[int, int], n: int) -> npt.NDArray[np.float64]:
     return np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, n), np.linspace(-0.5, h - 0.5, n)), -1)
 
 
-def _road_below_horizon(camera: Camera | None, size: tuple[int, ...]) -> BoolArray:
-    """Nodes ``_STEP_PX`` apart of a view (h, w) that look down, as in ``ViewPlan.road``."""
-    y, x = (np.arange(0, n + _STEP_PX, _STEP_PX, dtype=np.float64) for n in size)
-    if camera is None:
-        return np.zeros((len(y), len(x)), bool)
+def _road_below_horizon(camera: Camera) -> BoolArray:
+    """Nodes ``_STEP_PX`` apart of a view that look down, as in ``ViewPlan.road``."""
+    y, x = (np.arange(0, n + _STEP_PX, _STEP_PX, dtype=np.float64) for n in camera.size)
     return camera.unproject(np.stack(np.meshgrid(x, y), -1)).directions[..., 2] < 0
 
 

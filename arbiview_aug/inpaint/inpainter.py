@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -21,8 +20,6 @@ from arbiview_aug.sample.inputs import read_frames
 
 Tensors = Sequence[torch.Tensor]
 
-_MASK_KEYS = ("coverage", "generated")
-
 RADIUS_PX = 3.0  # radius of Telea's neighbourhood, from OpenCV's example
 _MARGIN_PX = 8  # margin around holes that Telea's method reads
 GREY = 0.5  # value of images without known pixels
@@ -31,7 +28,7 @@ SOURCES_KEY = "sources"
 """Sample key of the source images and calibration, for inpainting after collating."""
 
 
-class Inpainter(ABC):
+class Inpainter:
     """Fills the holes of rendered views. A new one defines ``inpaint``; ``RigRetarget(holes=...)`` takes it.
 
     Attributes:
@@ -55,7 +52,6 @@ class Inpainter(ABC):
     def needs_confidence(self) -> bool:
         return self.min_confidence > 0
 
-    @abstractmethod
     def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         """Fill the holes (h, w) bool of views (3, h, w), uint8 or float in [0, 1], of any frames together.
 
@@ -64,6 +60,7 @@ class Inpainter(ABC):
             holes: Copies of the pixels to fill; all others of the result are ignored.
             seeds: A seed for each view.
         """
+        raise NotImplementedError(f"{type(self).__name__} fills whole frames: call fill")
 
     def _inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int], counts: Sequence[int]) -> Any:
         """``inpaint`` of copies, into which it may write; ``counts`` are how many views each frame has."""
@@ -78,11 +75,8 @@ class Inpainter(ABC):
         parts = [holes_of(frame, self.min_confidence) for frame in rendered]
         unknown = [~seen if self.fills_own_car else hole for maps in parts for seen, hole in zip(*maps, strict=True)]
         names = frame_names(frames) if self.is_random else [""] * len(frames)
-        seeds = [
-            seeded(self.seed, name, str(k)).initial_seed() if self.is_random else 0
-            for name, frame in zip(names, rendered, strict=True)
-            for k in range(len(frame.rig))
-        ]
+        named = zip(names, rendered, strict=True)
+        seeds = [seeded(self.seed, name, str(k)).initial_seed() for name, frame in named for k in range(len(frame.rig))]
         views = [view for frame in rendered for view in frame.images]
         with torch.no_grad():
             images = self._inpaint(views, unknown, seeds, [len(frame.rig) for frame in rendered])
@@ -118,24 +112,18 @@ class Inpainter(ABC):
         lead = leading_shape(batch["images"])
         if len(sources) != len(views):
             raise SampleError(f"complete: expected sources of {len(views)} frames, got {len(sources)}")
-        maps = {key: split(key, batch[key], lead) for key in MAP_KEYS if key in batch}
-        for key, frames in maps.items():
-            _check_maps(key, frames, views)
-        is_filled = maps.pop("generated", None) is not None  # by ``holes`` of the transform
+        maps = {key: split(key, batch[key], lead) for key in MAP_KEYS if key in batch and key != "generated"}
         rendered = []
         for b, view in enumerate(views):
-            if is_filled:
-                seen_and_images = zip(maps["coverage"][b], view.images, strict=True)
-                images = [torch.where(seen, image, 0) for seen, image in seen_and_images]
-            else:
-                images = [image.clone() for image in view.images]  # some fill in place
-            rendered.append(Views(images, view.rig, **{key: frames[b] for key, frames in maps.items()}))
+            frame_maps = {key: frames[b] for key, frames in maps.items()}
+            for key, tensors in frame_maps.items():
+                _check_maps(f"complete: {key}: frame {b}", tensors, view.images, key == "coverage")
+            rendered.append(Views(_black_without(frame_maps["coverage"], view.images), view.rig, **frame_maps))
         done = []
         for frame in self.fill(rendered, sources):  # black and not marked where only the own car is
             _, holes = holes_of(frame, 0)
-            shown = zip(frame.coverage, holes, frame.images, strict=True)
-            images = [torch.where(seen | hole, image, 0) for seen, hole, image in shown]
-            done.append(replace(frame, images=images, generated=stacked(holes)))
+            shown = [seen | hole for seen, hole in zip(frame.coverage, holes, strict=True)]
+            done.append(replace(frame, images=_black_without(shown, frame.images), generated=stacked(holes)))
         out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
         for key in (*maps, "generated"):
             out[key] = gathered([getattr(frame, key) for frame in done], lead)
@@ -143,19 +131,21 @@ class Inpainter(ABC):
         return out
 
 
-def _check_maps(key: str, maps: Sequence[Any], frames: Sequence[Frame]) -> None:
-    """Raise SampleError unless the maps of each frame are tensors (M, h, w) of its images' sizes, of the key's type."""
-    for number, (tensors, frame) in enumerate(zip(maps, frames, strict=True)):
-        tensors = tensors if isinstance(tensors, torch.Tensor | list | tuple) else [tensors]
-        got = [(getattr(m, "dtype", type(m)), tuple(getattr(m, "shape", ()))) for m in tensors]
-        sizes = [tuple(image.shape[-2:]) for image in frame.images]
-        is_mask = key in _MASK_KEYS
-        is_typed = all(isinstance(kind, torch.dtype) and (kind == torch.bool) == is_mask for kind, _ in got)
-        if not is_typed or [size for _, size in got] != sizes:
-            raise SampleError(
-                f"complete: {key}: frame {number}: expected {'bool' if is_mask else 'numbers'} of the images' sizes "
-                f"{sizes}, got {[f'{kind} {size}' for kind, size in got]}: pass what RigRetarget wrote"
-            )
+def _black_without(shown: Iterable[torch.Tensor], images: Tensors) -> list[torch.Tensor]:
+    """Copies of images, black where they are not shown (h, w)."""
+    return [torch.where(mask, image, 0) for mask, image in zip(shown, images, strict=True)]
+
+
+def _check_maps(where: str, maps: Any, images: Tensors, is_mask: bool) -> None:
+    """Raise SampleError unless maps are tensors (h, w) of the images' sizes, of bool if they are masks."""
+    maps = maps if isinstance(maps, torch.Tensor | list | tuple) else [maps]
+    got = [(getattr(m, "dtype", type(m)), tuple(getattr(m, "shape", ()))) for m in maps]
+    sizes = [tuple(image.shape[-2:]) for image in images]
+    is_typed = all(isinstance(kind, torch.dtype) and (kind == torch.bool) == is_mask for kind, _ in got)
+    if not is_typed or [size for _, size in got] != sizes:
+        expected = f"{'bool' if is_mask else 'numbers'} of the images' sizes {sizes}"
+        found = [f"{kind} {size}" for kind, size in got]
+        raise SampleError(f"{where}: expected {expected}, got {found}: pass what RigRetarget wrote")
 
 
 def _checked(name: str, images: Any, views: Tensors, holes: Tensors) -> list[torch.Tensor]:
@@ -179,9 +169,6 @@ class Black(Inpainter):
     """Leaves holes black; ``generated`` is not written."""
 
     outcome = "black: train with 'coverage' as a mask"
-
-    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
-        return list(views)
 
     def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         return list(rendered)

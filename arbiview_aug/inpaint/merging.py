@@ -90,42 +90,35 @@ def merged(
     Returns:
         (3, h, w) filled view, and (h, w) int16 index of the candidate taken, -1 for none.
     """
-    pixels, chosen = view.clone(), np.full(free.shape, -1, np.int16)
+    pixels, taken_by = view.clone(), np.full(free.shape, -1, np.int16)
     shows = np.logical_or.reduce([candidate.shows for candidate in candidates])
-    if (shows & free).any():
-        box = bounding_box(shows, margin_px)
-        parts = view[(..., *box)], free[box], seam[box], [candidate.part(box) for candidate in candidates]
-        pixels[(..., *box)], chosen[box] = _merged(*parts, margin_px)
-    return pixels, chosen
-
-
-def _merged(
-    view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
-) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
-    """As ``merged``, within the box that candidates show; exposures and votes are computed on a sample of pixels."""
-    # Without labels the borders of moved objects must be found.
+    if not (shows & free).any():
+        return pixels, taken_by
+    box = bounding_box(shows, margin_px)
+    part, free, seam, candidates = pixels[(..., *box)], free[box], seam[box], [c.part(box) for c in candidates]
+    # Exposures and votes are computed on a sample of pixels; without labels the borders of moved objects must be found.
     unlabelled = any((candidate.risk == ChangeRisk.UNLABELLED).any() for candidate in candidates)
     step, n = 1 if unlabelled else max(1, margin_px // _SAMPLES_PER_SEAM), len(candidates)
     every = slice(None, None, step), slice(None, None, step)
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     samples = [candidate.part(every) for candidate in candidates]
-    current, images = _levels(view[(..., *every)], levels), [_levels(candidate.image, levels) for candidate in samples]
+    current, images = _levels(part[(..., *every)], levels), [_levels(candidate.image, levels) for candidate in samples]
     recorded = [image.copy() if step > 1 else image for image in images]
     gains = _tone(current, images, free[every], seam[every], samples, max(1, margin_px // 2 // step))
     shown = np.stack([candidate.shows & free[every] for candidate in samples])
     accepted = shown & _accepted(current, images, shown, seam[every], samples, max(3, _WINDOW_PX // step | 1))
     # The order breaks ties.
-    rank, chosen = np.full(free.shape, 256 * n, np.uint16), np.full(free.shape, -1, np.int16)
+    rank, chosen = np.full(free.shape, 256 * n, np.uint16), taken_by[box]
     for k, candidate in enumerate(candidates):
         # Samples may miss a border.
-        flags = (part.view(np.uint8) for part in (accepted[k], shown[k] & ~accepted[k]))
-        accepts, rejects = (cv2.dilate(part, np.ones((3, 3), np.uint8)) > 0 for part in flags)
+        flags = accepted[k], shown[k] & ~accepted[k]
+        accepts, rejects = (cv2.dilate(flag.view(np.uint8), np.ones((3, 3), np.uint8)) > 0 for flag in flags)
         usable = of_cells(accepted[k] | (accepts & ~rejects & ~shown[k]), step, free.shape) & candidate.shows & free
         key = candidate.blur * np.uint16(n) + np.uint16(k)
         better = usable & (key < rank)
         np.copyto(rank, key, where=better)
         np.copyto(chosen, np.int16(k), where=better)
-    pixels = view.clone(memory_format=torch.contiguous_format)
+    filled = part.clone(memory_format=torch.contiguous_format)
     for k, candidate in enumerate(candidates):
         taken = np.flatnonzero(chosen == k)
         y, x = np.divmod(taken, free.shape[1])
@@ -135,8 +128,9 @@ def _merged(
             detail = _levels(candidate.image, levels).reshape(3, -1).take(taken, 1)
             colours += gains[k] * (detail - recorded[k].reshape(3, -1).take(at, 1))
         colours = np.clip(np.rint(colours) if levels == 1 else colours / np.float32(levels), 0, 255 / levels)
-        pixels.view(3, -1).index_copy_(1, torch.from_numpy(taken).to(view.device), torch.from_numpy(colours).to(view))
-    return pixels, chosen
+        filled.view(3, -1).index_copy_(1, torch.from_numpy(taken).to(view.device), torch.from_numpy(colours).to(view))
+    pixels[(..., *box)] = filled
+    return pixels, taken_by
 
 
 def _levels(image: torch.Tensor, levels: float) -> Levels:

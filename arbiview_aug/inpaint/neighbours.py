@@ -21,7 +21,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import PixelRays, RayCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.image_ops import FRESH, Memory, bounding_box, of_cells, some_of_cells
+from arbiview_aug.image_ops import FRESH, Memory, bounding_box, of_cells
 from arbiview_aug.inpaint.merging import Candidate, merged
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import Maps, Renderer, Views, confidence_of
@@ -68,23 +68,6 @@ class Hole:
         directions = np.moveaxis(np.tensordot(self.camera.cam2ego[:3, :3], self.rays.at(y, x), 1), 0, -1)
         return directions, np.maximum(self.inverse_distance[np.ix_(y, x)].astype(np.float64), 1e-6)
 
-    @cached_property
-    def wanted(self) -> BoolArray:
-        """Pixels (h, w) to plan in neighbours."""
-        return self.free | self.seam
-
-    @cached_property
-    def near(self) -> BoolArray:
-        """(ny + 1, nx + 1) corners of the cells that hold such pixels."""
-        cells = np.pad(some_of_cells(self.wanted, _CELL_PX), 1)
-        return np.asarray(cells[1:, 1:] | cells[1:, :-1] | cells[:-1, 1:] | cells[:-1, :-1])
-
-    @property
-    def points(self) -> FloatArray:
-        """Points that these corners see, in the ego frame (n, 3)."""
-        directions, q = (part[self.near] for part in self.nodes)
-        return np.asarray(self.camera.center_m + directions / q[:, None])
-
 
 class Fill(NamedTuple):
     """One neighbour's views of the holes."""
@@ -101,26 +84,21 @@ class Fills:
     holes: list[Hole]
     fills: list[Fill]
 
-    def shares(self, plan: RenderPlan) -> list[float]:
-        """For each target camera, the share of its pixels that neighbours show and the current frame does not."""
-        shares = [0.0] * len(plan.targets)
-        for k, hole in enumerate(self.holes):
-            seen = np.logical_or.reduce([fill.shown[k].shows for fill in self.fills])
-            shares[hole.target] = float((hole.free & seen).sum() / plan.targets[hole.target].source_camera.size)
-        return shares
+    def shares(self, plan: RenderPlan) -> tuple[list[float], list[str]]:
+        """The share of each target camera's pixels that neighbours alone show, and a line for each neighbour.
 
-    def lines(self, plan: RenderPlan) -> list[str]:
-        """One line for each neighbour: the share of pixels that neither the current frame nor a nearer one shows."""
-        pixels = sum(target.source_camera.size for target in plan.targets)
-        missing = [hole.free for hole in self.holes]
-        lines = []
+        The line says how many of all pixels neither the current frame nor a nearer one shows.
+        """
+        sizes = [target.source_camera.size for target in plan.targets]
+        missing, added, lines = [hole.free for hole in self.holes], np.zeros(len(sizes), int), []
         for fill in self.fills:
-            new = [free & candidate.shows for free, candidate in zip(missing, fill.shown, strict=True)]
-            missing = [free & ~shown for free, shown in zip(missing, new, strict=True)]
-            added = sum(map(np.count_nonzero, new))
-            where = f"{fill.neighbour.travel_m:.1f} m of travel"
-            lines.append(f"neighbour {fill.neighbour.name}, {where}: {added / pixels:.1%} of all pixels")
-        return lines
+            before = added.copy()
+            for k, (hole, candidate) in enumerate(zip(self.holes, fill.shown, strict=True)):
+                added[hole.target] += np.count_nonzero(missing[k] & candidate.shows)
+                missing[k] = missing[k] & ~candidate.shows
+            new, neighbour = (added - before).sum() / sum(sizes), fill.neighbour
+            lines.append(f"neighbour {neighbour.name}, {neighbour.travel_m:.1f} m of travel: {new:.1%} of all pixels")
+        return (added / sizes).tolist(), lines
 
 
 # --- planning ---------------------------------------------------------------------------------------------------------
@@ -182,18 +160,14 @@ def plan_fills(
     # A neighbour's cameras are not blended: one of them may see a moved object.
     config = replace(config, seam_width=0.0, layers=False)
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
-    wanted, points = [hole.wanted for hole in holes], [hole.points for hole in holes]
-    ends, fills = np.cumsum([len(hole_points) for hole_points in points]), []
+    wanted, fills = [hole.free | hole.seam for hole in holes], []
     for neighbour in neighbours:
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
         objects = BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None
         known = Scene(known=_HoleSurface(holes, full, objects))
         settings: dict[str, Any] = {"geometry": surface, "config": config, "scene": known, "maps": maps}
         views = build_plan(neighbour.rig, rig, wanted=wanted, **settings)
-        risks: Sequence[Any] = [None] * len(holes)
-        if neighbour.moved is not None:
-            risks = np.split(change_risks(neighbour.moved, np.concatenate(points)), ends[:-1])
-        shown = [_shown(*inputs, neighbour) for inputs in zip(holes, views.targets, risks, strict=True)]
+        shown = [_shown(hole, view, neighbour) for hole, view in zip(holes, views.targets, strict=True)]
         if any((hole.free & candidate.shows).any() for hole, candidate in zip(holes, shown, strict=True)):
             fills.append(Fill(neighbour, views, shown))
     return Fills(holes, fills) if fills else None
@@ -229,10 +203,11 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: Ra
     return Hole(index, box, camera, rays, free, around & allowed & covered[box], q, margin_px)
 
 
-def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neighbour: Neighbour) -> Candidate:
+def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
+    """The part of a hole that a neighbour shows."""
     from arbiview_aug.scene.kernels import upsample_where
 
-    usable = view.coverage & hole.wanted
+    usable = view.coverage & (hole.free | hole.seam)
     blur, risk = np.zeros(usable.shape, np.uint8), np.full(usable.shape, ChangeRisk.UNLABELLED, np.uint8)
     directions, q = hole.nodes
     for pair in view.pairs:
@@ -243,9 +218,9 @@ def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neig
         source_z, target_z = (np.maximum(np.abs(rays[..., 2]), 1e-9) for rays in (from_source, directions))
         halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * target_z * relative / (source.K[0, 0] * source_z)), 0, 255)
         upsample_where(halves.astype(np.float32), _CELL_PX, view.source_camera, pair.source, blur)
-    if risks is not None:
-        corners = np.zeros(q.shape, np.uint8)
-        corners[hole.near] = risks
+    if neighbour.moved is not None:
+        points = hole.camera.center_m + directions / q[..., None]
+        corners = change_risks(neighbour.moved, points.reshape(-1, 3)).reshape(q.shape)
         cells = np.maximum.reduce([corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:]])
         risk = of_cells(cells, _CELL_PX, usable.shape)
     return Candidate(usable, blur, risk, neighbour.is_later)
@@ -262,11 +237,11 @@ def fill_from_neighbours(
     """
     curves = rendered.curves
     tones = None if curves is None else [curves[hole.target][:, hole.box[0]] for hole in fills.holes]
-    neighbours = []
-    for fill in fills.fills:
-        sources = neighbour_images(fill.neighbour, images, warn)
-        if sources is not None:
-            neighbours.append((fill, renderer.views(fill.plan, sources, tones, images)))
+    neighbours = [
+        (fill, renderer.views(fill.plan, sources, tones, images))
+        for fill in fills.fills
+        if (sources := neighbour_images(fill.neighbour, images, warn)) is not None
+    ]
     if not neighbours:
         return rendered
     views = list(rendered.images)

@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from functools import partial
-from itertools import zip_longest
+from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.choices import is_whole
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, one_line
 from arbiview_aug.files import check_regular, open_regular
@@ -29,6 +30,7 @@ from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, che
 
 NARROW_PX = 5  # holes narrower than this are inpainted by Telea's method
 _SEED = 2**31
+_PIPELINE_SETTINGS = ("size", "batch", "prompt", "steps", "guidance", "min_confidence", "seed")
 _JOINED_PX = 8  # holes nearer than this to each other are one
 _CONTEXT_PX = (12, 64)
 """Minimum and maximum context around a hole, pixels; in between, half of its shorter side."""
@@ -45,9 +47,6 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         multiple: Sides that it sees are multiples of it.
         batch: Images that it sees at once.
         min_confidence: As for every ``Inpainter``, like ``seed``.
-
-    Attributes:
-        calls, pixels: How often it ran, and on how many pixels in all.
     """
 
     is_random = True
@@ -64,8 +63,7 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
     ) -> None:
         super().__init__()
         self.min_confidence, self.seed = checked_settings(min_confidence, seed)
-        whole = all(type(value) is int and value > 0 for value in (size, multiple, batch))
-        if not whole or size % multiple:
+        if not all(is_whole(value, 1) for value in (size, multiple, batch)) or size % multiple:
             raise ValueError(
                 "size, multiple, batch: expected whole numbers from 1, size a multiple of multiple, "
                 f"got {size!r}, {multiple!r} and {batch!r}"
@@ -74,7 +72,6 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         for parameter in network.parameters():  # a script's module has no requires_grad_
             parameter.requires_grad_(False)
         self.size, self.multiple, self.batch = size, multiple, batch
-        self.calls = self.pixels = 0
 
     def train(self, mode: bool = True) -> NetworkInpainter:
         """Leave the network in evaluation mode: a transform in a model that trains still inpaints."""
@@ -109,13 +106,10 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         left = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, square, **border).astype(bool) for mask in masks]
         frame_of = np.repeat(np.arange(len(counts)), counts)
         for together in windows(left, self.size):
-            # Frames share calls, but no canvas: a network sees all of it.
-            by_frame: dict[int, list[Window]] = defaultdict(list)
-            for window in together:
-                by_frame[frame_of[window.view]].append(window)
             alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
-            for parts in by_frame.values():
-                for canvas in packed(parts, self.size, self.multiple):
+            # Frames share calls, but no canvas: a network sees all of it.
+            for _, parts in groupby(together, lambda window: frame_of[window.view]):
+                for canvas in packed(list(parts), self.size, self.multiple):
                     alike[canvas.size].append(canvas)
             for canvases in alike.values():
                 for start in range(0, len(canvases), self.batch):
@@ -128,23 +122,17 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         return filled
 
     def _fill(
-        self,
-        canvases: Sequence[Canvas],
-        pixels: Sequence[np.ndarray],
-        left: Sequence[np.ndarray],
-        seeds: Sequence[int],
+        self, canvases: Sequence[Canvas], pixels: Sequence[np.ndarray], left: Sequence[np.ndarray], seeds: Sequence[int]
     ) -> None:
         """Inpaint canvases of one size, and put their pixels where they belong; their holes are no longer left."""
-        images, holes = zip(*(drawn(canvas, pixels, left) for canvas in canvases), strict=True)
-        inputs = torch.from_numpy(np.stack(images)).to(self.device), torch.from_numpy(np.stack(holes)).to(self.device)
-        outputs = self.run(*inputs, [seeds[canvas.windows[0][0].view] for canvas in canvases])
-        if not isinstance(outputs, torch.Tensor) or outputs.shape != inputs[0].shape:
+        drawings = [drawn(canvas, pixels, left) for canvas in canvases]
+        images, holes = (torch.from_numpy(np.stack(part)).to(self.device) for part in zip(*drawings, strict=True))
+        outputs = self.run(images, holes, [seeds[canvas.windows[0][0].view] for canvas in canvases])
+        if not isinstance(outputs, torch.Tensor) or outputs.shape != images.shape:
             got = tuple(getattr(outputs, "shape", ())) or type(outputs).__name__
-            raise GeneratorError(f"inpainting: expected images {tuple(inputs[0].shape)}, got {got}")
+            raise GeneratorError(f"inpainting: expected images {tuple(images.shape)}, got {got}")
         if not bool(torch.isfinite(outputs).all()):
             raise GeneratorError("inpainting: expected finite images, got NaN or infinity; try float32")
-        self.calls += 1
-        self.pixels += inputs[1].numel()
         painted = outputs.float().clamp(0, 1).cpu().numpy()
         for canvas, image in zip(canvases, painted, strict=True):
             for window, top, at in canvas.windows:
@@ -154,51 +142,45 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
 
 
 class PipelineInpainter(NetworkInpainter):
-    """One of diffusers' inpainting pipelines, by ``from_pretrained``."""
+    """One of diffusers' inpainting pipelines: Stable Diffusion, SDXL, Flux and others.
+
+    Args:
+        pipeline: A pipeline of ``AutoPipelineForInpainting``; ``from_pretrained`` loads one.
+        size: Longest side of an image that it sees; None: the pipeline's own.
+        batch: Images that it sees at once.
+        prompt: Text prompt for the holes.
+        steps: Steps of the pipeline; None: its own.
+        guidance: Guidance of the pipeline; None: its own.
+        settings: ``min_confidence`` and ``seed``, as for every ``Inpainter``.
+    """
 
     def __init__(
         self,
         pipeline: Any,
-        size: int,
-        multiple: int,
-        batch: int,
-        prompt: str,
-        *,
-        steps: int | None = None,
-        guidance: float | None = None,
-        **settings: Any,
-    ) -> None:
-        parts = {name: part for name, part in pipeline.components.items() if isinstance(part, torch.nn.Module)}
-        super().__init__(torch.nn.ModuleDict(parts), size, multiple, batch, **settings)
-        checked_settings(self.min_confidence, self.seed, steps, guidance)
-        self.pipeline, self.prompt, self.steps, self.guidance = pipeline, prompt, steps, guidance
-        pipeline.set_progress_bar_config(disable=True)
-
-    @classmethod
-    def from_pretrained(
-        cls,
-        where: str | Path,
         *,
         size: int | None = None,
         batch: int = 4,
         prompt: str = "",
         steps: int | None = None,
         guidance: float | None = None,
-        min_confidence: float = 0.0,
-        seed: int = 0,
         **settings: Any,
-    ) -> PipelineInpainter:
-        """Load a pipeline of ``AutoPipelineForInpainting``: Stable Diffusion, SDXL, Flux and others.
+    ) -> None:
+        parts = {name: part for name, part in pipeline.components.items() if isinstance(part, torch.nn.Module)}
+        multiple = int(pipeline.vae_scale_factor)
+        core = getattr(pipeline, "unet", None) or pipeline.transformer
+        native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
+        size = native_px if size is None else size
+        super().__init__(torch.nn.ModuleDict(parts), size, multiple, batch, **settings)
+        checked_settings(self.min_confidence, self.seed, steps, guidance)
+        self.pipeline, self.prompt, self.steps, self.guidance = pipeline, prompt, steps, guidance
+        pipeline.set_progress_bar_config(disable=True)
 
-        Args:
-            where: A folder or hub id in diffusers' layout.
-            size: Longest side of an image that it sees; None: the pipeline's own.
-            batch: Images that it sees at once.
-            prompt: Text prompt for the holes.
-            steps: Steps of the pipeline; None: its own.
-            guidance: Guidance of the pipeline; None: its own.
-            min_confidence: As for every ``Inpainter``, like ``seed``.
-            settings: Arguments of diffusers' ``from_pretrained``, for example ``torch_dtype`` or ``revision``.
+    @classmethod
+    def from_pretrained(cls, where: str | Path, **settings: Any) -> PipelineInpainter:
+        """Load a pipeline from a folder or hub id in diffusers' layout.
+
+        ``settings`` are those of the class, and arguments of diffusers' ``from_pretrained``, for example
+        ``torch_dtype`` or ``revision``.
 
         Raises:
             ImportError: diffusers or transformers are missing.
@@ -206,16 +188,13 @@ class PipelineInpainter(NetworkInpainter):
         """
         diffusers = optional_package("diffusers", "generator")
         optional_package("transformers", "generator")
+        own = {name: settings.pop(name) for name in _PIPELINE_SETTINGS if name in settings}
         try:
             check_regular(where)
             pipeline = diffusers.AutoPipelineForInpainting.from_pretrained(where, **settings)
         except (OSError, ValueError, RuntimeError, AttributeError) as error:
             raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {one_line(error)}") from None
-        multiple = int(pipeline.vae_scale_factor)
-        core = getattr(pipeline, "unet", None) or pipeline.transformer
-        native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
-        shared: dict[str, Any] = {"steps": steps, "guidance": guidance, "min_confidence": min_confidence, "seed": seed}
-        return cls(pipeline, native_px if size is None else size, multiple, batch, prompt, **shared)
+        return cls(pipeline, **own)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         h, w = images.shape[-2:]
@@ -325,7 +304,7 @@ def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
 
 
 def _parts(hole: Window, shape: tuple[int, ...], size: int) -> Iterator[Window]:
-    """Cut a hole of a view (h, w) into parts whose windows fit, and are small together."""
+    """Cut a hole of a view (h, w) in halves until its windows fit, and while halves are small together."""
     rows, columns = (np.flatnonzero(hole.fills.any(1 - axis)) for axis in (0, 1))
     part = hole.fills[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     top, left = hole.top + int(rows[0]), hole.left + int(columns[0])
@@ -334,35 +313,20 @@ def _parts(hole: Window, shape: tuple[int, ...], size: int) -> Iterator[Window]:
         (min(context, low), min(context, side - low - length))
         for low, length, side in zip((top, left), part.shape, shape, strict=True)
     ]
-    axis, at = _cut(part, context)
     sides = [length + sum(margin) for length, margin in zip(part.shape, margins, strict=True)]
-    if max(sides) > size:
-        axis = int(np.argmax(sides))
-        at = part.shape[axis] // 2
-    if at:
-        first, second = np.split(part, [at], axis)
-        yield from _parts(Window(hole.view, top, left, first), shape, size)
-        yield from _parts(Window(hole.view, top + at * (axis == 0), left + at * axis, second), shape, size)
+    axis = int(np.argmax(part.shape))
+    at = part.shape[axis] // 2
+    halves = np.split(part, [at], axis)
+    if at and (max(sides) > size or sum(_area(half, context) for half in halves) < _WORTH * _area(part, context)):
+        yield from _parts(Window(hole.view, top, left, halves[0]), shape, size)
+        yield from _parts(Window(hole.view, top + at * (axis == 0), left + at * axis, halves[1]), shape, size)
     else:
         yield Window(hole.view, top - margins[0][0], left - margins[1][0], np.pad(part, margins))
 
 
-def _cut(part: BoolArray, context: int) -> tuple[int, int]:
-    """Axis and position of the cut of a hole that saves most pixels; position 0 if it saves too few."""
-    best, cut = _WORTH * (part.shape[0] + 2 * context) * (part.shape[1] + 2 * context), (0, 0)
-    for axis, lines in enumerate((part, part.T)):
-        both = _areas(lines, context)[:-1] + _areas(lines[::-1], context)[-2::-1]
-        if len(both) and both.min() < best:
-            best, cut = both.min(), (axis, int(both.argmin()) + 1)
-    return cut
-
-
-def _areas(lines: BoolArray, context: int) -> npt.NDArray[np.int64]:
-    """Numbers of pixels in the windows of a hole's first row, first two rows, and so on."""
-    width, some = lines.shape[1], lines.any(1)
-    first = np.minimum.accumulate(np.where(some, lines.argmax(1), width))
-    last = np.maximum.accumulate(np.where(some, width - lines[:, ::-1].argmax(1), 0))
-    return (np.arange(1, len(lines) + 1) + 2 * context) * (last - first + 2 * context)
+def _area(hole: BoolArray, context: int) -> int:
+    """Number of pixels in the window of a hole (h, w)."""
+    return int(np.prod([np.ptp(at) + 1 + 2 * context for at in hole.nonzero()]))
 
 
 def packed(parts: Sequence[Window], size: int, multiple: int) -> list[Canvas]:
@@ -370,7 +334,7 @@ def packed(parts: Sequence[Window], size: int, multiple: int) -> list[Canvas]:
     shelves: list[list[int]] = []  # canvas, row, height, columns taken
     rows: list[int] = []  # taken of each canvas
     placed: list[list[tuple[Window, int, int]]] = []
-    for window in sorted(parts, key=lambda item: (-item.fills.shape[0], -item.fills.shape[1])):
+    for window in sorted(parts, key=lambda item: item.fills.shape, reverse=True):
         h, w = window.fills.shape
         shelf = next((item for item in shelves if item[2] >= h and item[3] + w <= size), None)
         if shelf is None:

@@ -49,7 +49,7 @@ _PAIRS, _MOST_POINTS = 256, 4000
 
 @dataclass(frozen=True, eq=False)
 class LearnedDepth(MotionDepth):
-    """Depth maps of a network, at the size of ``motion_camera``; ``words`` name the model and each camera's fit."""
+    """Depth maps of a network; ``words`` name the model and each camera's fit."""
 
     def __str__(self) -> str:
         return f"learned depth: {self.density:.0%} of the pixels, {self.words}"
@@ -79,10 +79,10 @@ class CameraFit(NamedTuple):
     declined: str = ""
 
     def __str__(self) -> str:
-        to, error = f"{self.points} points of {self.reference}", f"residual {self.residual or 0:.1%}"
-        if self.declined:
-            return f"{self.camera}: declined, {self.declined}{'' if self.residual is None else f' ({error}, {to})'}"
-        return f"{self.camera}: fitted to {to}, {error}"
+        fit = f"fitted to {self.points} points of {self.reference}, residual {self.residual or 0:.1%}"
+        if not self.declined:
+            return f"{self.camera}: {fit}"
+        return f"{self.camera}: declined, {self.declined}{'' if self.residual is None else f' ({fit})'}"
 
 
 def learned_depth(
@@ -95,53 +95,45 @@ def learned_depth(
 
     Each camera is fitted to the first reference of ``wanted`` with enough points.
     """
-    views = {(n, k): View.of(frame, k) for n, frame in enumerate(frames) for k in range(len(frame.rig))}
+    images = {(n, k): _pinhole_image(f.rig[k], f.images[k]) for n, f in enumerate(frames) for k in range(len(f.rig))}
     predictions: dict[tuple[int, int], Layer] = {}
-    for shape in dict.fromkeys(view.image.shape for view in views.values()):
-        keys = [key for key, view in views.items() if view.image.shape == shape]
+    for shape in dict.fromkeys(image.shape for image in images.values()):
+        keys = [key for key, image in images.items() if image.shape == shape]
         for part in (keys[start : start + batch] for start in range(0, len(keys), batch)):
-            predictions |= zip(part, model.predict([views[key] for key in part]), strict=True)
+            predictions |= zip(part, model.predict([images[key] for key in part]), strict=True)
     for n, frame in enumerate(frames):
-        predicted = [(views[n, k], predictions[n, k]) for k in range(len(frame.rig))]
-        depth_m, fits = _fitted(frame, predicted, model.output, wanted)
+        fitted = [_fit_camera(frame, k, predictions[n, k], model.output, wanted) for k in range(len(frame.rig))]
+        depth_m, fits = zip(*fitted, strict=True)
         lines = [f"{model.name}, revision {model.revision}, licence {model.licence}", *map(str, fits)]
-        yield LearnedDepth(tuple(depth_m), "\n  ".join(lines)), fits
+        yield LearnedDepth(depth_m, "\n  ".join(lines)), list(fits)
 
 
-# --- images for the network -------------------------------------------------------------------------------------------
-class View(NamedTuple):
-    """A camera's image as a pinhole camera would have taken it."""
-
-    camera: Camera  # the camera at the size of its depth map
-    pinhole: Camera  # the pinhole camera
-    ground_z_m: float  # height of the road in their ego frame
-    image: torch.Tensor  # (3, h, w) uint8, a copy
-
-    @staticmethod
-    def of(frame: DepthInputs, k: int) -> View:
-        """The image of a frame's camera, its lens taken out."""
-        camera, image = frame.rig[k], frame.images[k]
-        image = image.clone() if image.dtype == torch.uint8 else (image * 255).round().to(torch.uint8)
-        pinhole = camera.undistorted()
-        if not camera.is_rectilinear:
-            uv = camera.project_cam(pinhole.unproject_cam(pinhole.pixel_grid()).directions).uv.astype(np.float32)
-            pixels: Any = cv2.remap(image.permute(1, 2, 0).numpy(), uv, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
-            image = torch.from_numpy(pixels).permute(2, 0, 1)
-        return View(motion_camera(camera), pinhole, frame.rig.ground_z_m, image)
-
-    def sampled(self, values: Layer) -> tuple[Layer, BoolArray]:
-        """A prediction over the pinhole image at the pixels of the depth map, and where it is known."""
-        rays, valid = self.camera.unproject_cam(self.camera.pixel_grid())
-        uv, z, _ = self.pinhole.project_cam(np.where(valid[..., None], rays, [0.0, 0.0, 1.0]))
-        seen = valid & (z > 0) & self.pinhole.contains(uv, 0.5)
-        if self.camera.mask is not None:
-            seen &= self.camera.mask
-        scale = np.array(values.shape[::-1]) / self.pinhole.size[::-1]
-        at = ((uv + 0.5) * scale - 0.5).astype(np.float32)
-        layer: Any = cv2.remap(values, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        return layer, seen & np.isfinite(layer)
+def _pinhole_image(camera: Camera, image: torch.Tensor) -> torch.Tensor:
+    """A copy (3, h, w) uint8 of a camera's image, its lens taken out: networks know pinhole images."""
+    image = image.clone() if image.dtype == torch.uint8 else (image * 255).round().to(torch.uint8)
+    if camera.is_rectilinear:
+        return image
+    rays = camera.undistorted().unproject_cam(camera.pixel_grid()).directions
+    uv = camera.project_cam(rays).uv.astype(np.float32)
+    pixels: Any = cv2.remap(image.permute(1, 2, 0).numpy(), uv, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+    return torch.from_numpy(pixels).permute(2, 0, 1)
 
 
+def _sampled(camera: Camera, values: Layer) -> tuple[Layer, BoolArray]:
+    """A prediction over a camera's pinhole image at the pixels of its depth map, and where it is known."""
+    pinhole, camera = camera.undistorted(), motion_camera(camera)
+    rays, valid = camera.unproject_cam(camera.pixel_grid())
+    uv, z, _ = pinhole.project_cam(np.where(valid[..., None], rays, [0.0, 0.0, 1.0]))
+    seen = valid & (z > 0) & pinhole.contains(uv, 0.5)
+    if camera.mask is not None:
+        seen &= camera.mask
+    scale = np.array(values.shape[::-1]) / pinhole.size[::-1]
+    at = ((uv + 0.5) * scale - 0.5).astype(np.float32)
+    layer: Any = cv2.remap(values, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    return layer, seen & np.isfinite(layer)
+
+
+# --- references of depth ----------------------------------------------------------------------------------------------
 def measured_pixels(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray]:
     """Pixels (rows, columns) of LiDAR points that a camera sees, and their z-depths."""
     uv, z, valid = camera.project(points[:, :3])
@@ -153,10 +145,9 @@ def measured_pixels(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray
     return (row[nearest], column[nearest]), z[seen][nearest]
 
 
-# --- references of depth ----------------------------------------------------------------------------------------------
-def _references(frame: DepthInputs, k: int, view: View, seen: BoolArray) -> Iterator[tuple[Reference, Any, FloatArray]]:
-    """Measurements that a camera may be fitted to: its name, pixels (rows, columns) and z-depths."""
-    camera = view.camera
+def _references(frame: DepthInputs, k: int, seen: BoolArray) -> Iterator[tuple[Reference, Any, FloatArray]]:
+    """Measurements that a camera may be fitted to: their name, pixels (rows, columns) and z-depths."""
+    camera = motion_camera(frame.rig[k])
     if frame.points is not None:
         pixels, depth_m = measured_pixels(camera, frame.points)
         ask = seen[pixels]
@@ -198,33 +189,31 @@ def _feature(form: _Form, values: FloatArray) -> FloatArray:
     return 1 / np.maximum(values, 1e-6) if form == "depth" else values
 
 
-def _fitted(
-    frame: DepthInputs, predicted: Sequence[tuple[View, Layer]], output: Output, wanted: Sequence[Reference]
-) -> tuple[list[Layer], list[CameraFit]]:
-    """The depth map and the fit of each camera."""
-    depth, fits = list[Layer](), list[CameraFit]()
-    too_few = f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}"
-    for k, (view, prediction) in enumerate(predicted):
-        values, seen = view.sampled(prediction)
-        references = _references(frame, k, view, seen)
-        known = (entry for entry in references if entry[0] in wanted and len(entry[2]) >= LEAST_POINTS)
-        reference, pixels, depth_m = next(known, (None, (), np.zeros(0)))
-        metres = np.zeros(values.shape)
-        if reference is None:
-            fits.append(CameraFit(view.camera.name, declined=too_few))
-        else:
-            step = -(-len(depth_m) // _MOST_POINTS)
-            x, depth_m = values[pixels][::step].astype(float), depth_m[::step]
-            line, residual, declined = fit_depth(x, depth_m, output)
-            fits.append(CameraFit(view.camera.name, reference, len(depth_m), residual, declined))
-            if line is not None and not declined:
-                metres = line.depth(np.where(seen, values, 1.0).astype(float))
-        depth.append(np.where(seen & (metres > _NEAREST_M), metres.clip(max=FARTHEST_M), 0).astype(np.float32))
-    return depth, fits
+def _fit_camera(
+    frame: DepthInputs, k: int, prediction: Layer, output: Output, wanted: Sequence[Reference]
+) -> tuple[Layer, CameraFit]:
+    """The depth map of a frame's camera and its fit; 0 everywhere if it is declined."""
+    values, seen = _sampled(frame.rig[k], prediction)
+    nothing, name = np.zeros(values.shape, np.float32), frame.rig[k].name
+    references = _references(frame, k, seen)
+    known = next((part for part in references if part[0] in wanted and len(part[2]) >= LEAST_POINTS), None)
+    if known is None:
+        return nothing, CameraFit(name, declined=f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}")
+    reference, pixels, depth_m = known
+    step = -(-len(depth_m) // _MOST_POINTS)
+    x, depth_m = values[pixels][::step].astype(float), depth_m[::step]
+    line, residual, declined = fit_depth(x, depth_m, output)
+    fit = CameraFit(name, reference, len(depth_m), residual, declined)
+    if line is None or declined:
+        return nothing, fit
+    metres = line.depth(np.where(seen, values, 1.0).astype(float))
+    return np.where(seen & (metres > _NEAREST_M), metres.clip(max=FARTHEST_M), 0).astype(np.float32), fit
 
 
 def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[_Line | None, float | None, str]:
     """Fit a network's output (P,) to depths (P,): the fit, its residual, and why it is declined, or nothing."""
+    if np.ptp(values) == 0:
+        return None, None, "its output is the same everywhere"
     fits: list[tuple[float, float, _Line]] = []
     for form in _FORMS.get(output, get_args(_Form)):
         x, y = _feature(form, values), depth_m if form == "affine depth" else 1 / depth_m
@@ -233,8 +222,6 @@ def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[
         if scale > 0:
             residual = float(np.median(np.abs(scale * x + shift - y) / limit))
             fits.append((residual, float(np.median(np.abs(np.median(y) - y) / limit)), _Line(form, scale, shift)))
-    if np.ptp(values) == 0:
-        return None, None, "its output is the same everywhere"
     if not fits:
         return None, None, "near and far are swapped, or look alike: the scale is not positive"
     residual, constant, line = min(fits)
@@ -252,8 +239,6 @@ def _robust_line(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[floa
         scale = (y[second] - y[first]) / (x[second] - x[first])
         shift = y[first] - scale * x[first]
         cost = np.minimum(np.abs(scale[:, None] * x + shift[:, None] - y) * weight, _OUTLIER).mean(1)
-    if not np.isfinite(cost).any():  # the output is constant
-        return 0.0, float(np.median(y))
     best = int(np.nanargmin(cost))
     line = np.array([scale[best], shift[best]])
     columns = np.stack([x, np.ones_like(x)], 1)
@@ -268,6 +253,15 @@ def _robust_line(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[floa
 
 
 # --- networks of transformers -----------------------------------------------------------------------------------------
+_PARTS = {
+    "AutoConfig": "a folder with config.json, or a model of the Hugging Face Hub",
+    "AutoModelForDepthEstimation": "a model that estimates depth, and its weights, "
+    "for example depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf",
+    "AutoImageProcessor": "preprocessor_config.json next to the model",
+}
+"""Parts of a model, by their classes in transformers, and what each needs."""
+
+
 class TransformersDepth:
     """A model of ``AutoModelForDepthEstimation``, with its image processor.
 
@@ -284,17 +278,15 @@ class TransformersDepth:
             transformers = optional_package("transformers", "depth")
         except ImportError as error:
             raise DataError(f"--model: {error}") from None
-        folder = Path(name)
-        option, known = f"--model {name}", "a folder with config.json, or a model of the Hugging Face Hub"
-        config = load_pretrained(transformers.AutoConfig, option, name, known)
-        if type(config) not in transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
-            raise DataError(
-                f"{option}: expected a model that estimates depth, such as "
-                f"depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf, got {type(config).__name__}"
-            )
-        expected = "preprocessor_config.json beside the model"
-        self._processor = load_pretrained(transformers.AutoImageProcessor, option, name, expected)
-        model = load_pretrained(transformers.AutoModelForDepthEstimation, option, name, "weights of the model")
+        folder, loaded = Path(name), []
+        for kind, expected in _PARTS.items():
+            try:
+                check_regular(name)
+                loaded.append(getattr(transformers, kind).from_pretrained(name))
+            except Exception as error:  # of many types, some of many lines
+                why = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+                raise DataError(f"--model {name}: expected {expected}: {why.strip()[:300]}") from None
+        config, model, self._processor = loaded
         self.model, self.device = model.float().eval().to(device), device
         commit = str(getattr(config, "_commit_hash", None) or "unknown")[:12]
         self.name, self.revision, card = name, commit, name
@@ -310,14 +302,13 @@ class TransformersDepth:
         self.output: Output = {"metric": "depth", "relative": "inverse"}.get(stated)  # type: ignore[assignment]
 
     @torch.inference_mode()
-    def predict(self, views: Sequence[View]) -> list[Layer]:
-        """Predict the depth of images of one size in one batch.
+    def predict(self, images: Sequence[torch.Tensor]) -> list[Layer]:
+        """Predict the depth of images (3, h, w) uint8 of one size in one batch.
 
         Raises:
             DataError: The batch does not fit on the device.
         """
-        images = [view.image for view in views]
-        inputs = self._processor(images=images, return_tensors="pt").to(self.device)
+        inputs = self._processor(images=list(images), return_tensors="pt").to(self.device)
         try:
             out = self.model(**inputs)
         except torch.OutOfMemoryError:
@@ -325,13 +316,3 @@ class TransformersDepth:
         size = tuple(images[0].shape[-2:])
         done = self._processor.post_process_depth_estimation(out, [size] * len(images))  # takes padding away
         return [entry["predicted_depth"].float().cpu().numpy() for entry in done]
-
-
-def load_pretrained(kind: Any, option: str, name: str, expected: str) -> Any:
-    """Load a part of a model of transformers, a folder or hub id; DataError names the option and what was expected."""
-    try:
-        check_regular(name)
-        return kind.from_pretrained(name)
-    except Exception as error:  # of many types, some of many lines
-        why = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise DataError(f"{option}: expected {expected}: {why.strip()[:300]}") from None

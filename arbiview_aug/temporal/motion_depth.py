@@ -80,13 +80,6 @@ class MotionDepth:
         return f"depth from motion: {self.density:.0%} of the pixels, {self.words}"
 
 
-class _Side(NamedTuple):
-    """A neighbour with its images at the working size."""
-
-    neighbour: Neighbour
-    images: list[SweptImage]
-
-
 Estimate = tuple[Layer, BoolArray]
 """Inverse distances (h, w) of one camera, 1/m, and their validity."""
 
@@ -112,46 +105,43 @@ def motion_depth(
 
     usable = [neighbour for neighbour in neighbours if TRAVEL_M[0] <= neighbour.travel_m <= TRAVEL_M[1]]
     usable.sort(key=lambda neighbour: abs(neighbour.travel_m - BEST_TRAVEL_M))
-    sides = []
+    used, others = list[Neighbour](), list[list[SweptImage]]()  # up to one before and one after, and their images
     for is_ahead in (False, True):
         for neighbour in usable:
             if (neighbour.ahead_m > 0) == is_ahead and (seen := load(neighbour)) is not None:
                 objects = np.zeros((0, 7)) if neighbour.boxes is None else neighbour.boxes
                 objects = objects[_moved_m(objects, labels) > STAYED_M]
-                sides.append(_Side(neighbour, _swept(neighbour.rig, seen, objects, rig.ground_z_m)))
+                used.append(neighbour)
+                others.append(_swept(neighbour.rig, seen, objects, rig.ground_z_m))
                 break
-    if not sides:
+    if not used:
         return declined(f"no frame {TRAVEL_M[0]:g} to {TRAVEL_M[1]:g} m before or after it can be used")
     # Labels may have moved by less than labels jitter, and by any way if no neighbour is labelled.
-    labelled = [(_moved_m(labels, n.boxes), n.travel_m) for n, _ in sides if n.boxes is not None]
+    labelled = [(_moved_m(labels, n.boxes), n.travel_m) for n in used if n.boxes is not None]
     moved, unsure = np.zeros(len(labels), bool), np.full(len(labels), not labelled)
     for moved_m, travel_m in labelled:
         moved |= moved_m > STAYED_M
         unsure |= moved_m > LABEL_ERROR * travel_m
     unsure &= ~moved
     swept = _swept(rig, images, labels[moved], rig.ground_z_m)
-    if any(min(image.camera.size) < 2 for part in (swept, *(side.images for side in sides)) for image in part):
+    if any(min(image.camera.size) < 2 for part in (swept, *others) for image in part):
         return declined("images one pixel wide or high have nothing to interpolate")
-    words = f"from {' and '.join(side.neighbour.name for side in sides)}"
+    words = f"from {' and '.join(neighbour.name for neighbour in used)}"
     for correction in range(MAX_CORRECTIONS + 1):
-        counterparts = [[side.images[k] for side in sides] for k in range(len(swept))]
-        coarse = [_coarse(image, sides_images) for image, sides_images in zip(swept, counterparts, strict=True)]
-        errors = [pose_error(swept, side.images, coarse) for side in sides]
+        counterparts = list(zip(*others, strict=True))
+        coarse = list(map(_coarse, swept, counterparts))
+        errors = [pose_error(swept, side, coarse) for side in others]
+        for neighbour, error in zip(used, errors, strict=True):
+            if error is None:
+                return declined(f"too little of frame {neighbour.name} is alike to tell whether its pose is right")
+            if correction == MAX_CORRECTIONS and error.error_px > MAX_ERROR_PX:
+                return declined(f"the pose of frame {neighbour.name} errs by {error}")
         measured = [error for error in errors if error is not None]
-        if len(measured) < len(sides):
-            lost = sides[errors.index(None)].neighbour.name
-            return declined(f"too little of frame {lost} is alike to tell whether its pose is right")
-        worst = max(measured, key=lambda error: error.error_px)
-        if worst.error_px <= CORRECTED_PX:
+        if correction == MAX_CORRECTIONS or max(error.error_px for error in measured) <= CORRECTED_PX:
             break
-        if correction < MAX_CORRECTIONS:
-            words += f"{'; poses corrected by' if correction == 0 else ', then'} {' and '.join(map(str, measured))}"
-            sides = [
-                side._replace(images=[image.moved(_pose(error.change)) for image in side.images])
-                for side, error in zip(sides, measured, strict=True)
-            ]
-        elif worst.error_px > MAX_ERROR_PX:
-            return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
+        words += f"{', then' if correction else '; poses corrected by'} {' and '.join(map(str, measured))}"
+        changes = [_pose(error.change) for error in measured]
+        others = [[image.moved(change) for image in side] for side, change in zip(others, changes, strict=True)]
     fine = map(partial(_match, stands=True), swept, counterparts, map(_walls, swept, coarse))
     return MotionDepth(tuple(map(partial(_depth_m, unsure=labels[unsure]), swept, fine)), words)
 
@@ -198,7 +188,7 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands
     # Clear matches away from the outlines of objects, which windows blur.
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
-        q, valid = stand_on_road(image, others, costs, float(walls[1]), q, valid)
+        q, valid = stand_on_road(image, costs, float(walls[1]), q, valid)
     return q, valid
 
 
@@ -287,8 +277,7 @@ _TURN_DEG, _SHIFT_M = 0.1, 0.02  # steps of the derivatives
 _REWEIGHTINGS = 5  # of iteratively reweighted least squares, against moving objects
 
 
-@dataclass(frozen=True, eq=False)
-class PoseError:
+class PoseError(NamedTuple):
     """Error of a neighbour's pose."""
 
     error_px: float  # mean displacement of pixels

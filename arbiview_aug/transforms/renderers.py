@@ -129,11 +129,11 @@ class Explanation:
         lines += [] if self.planned.motion is None else [str(self.planned.motion)]
         for key in DEPTH_WORDS.values():
             lines += self.planned.frame.further.get(key, "").splitlines()
-        lines += [] if self.fills is None else self.fills.lines(self.plan)
+        shares, fill_lines = self.fills.shares(self.plan) if self.fills else ([0.0] * len(target), [])
+        lines += fill_lines
         lines += [] if self.points is None else [self.points]
         head = f"{source.name or 'source'} -> {target.name or 'target'}: {len(source)} cameras to {len(target)}"
         lines = ["\n  ".join([head, *lines])]
-        shares = self.fills.shares(self.plan) if self.fills else [0.0] * len(target)
         for camera, view, filled in zip(target, self.plan.targets, shares, strict=True):
             covered = float(view.coverage.mean())
             note = f", up to {filled:.1%} more by other frames of the drive" if filled else ""

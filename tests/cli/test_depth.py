@@ -292,13 +292,13 @@ def test_models_that_cannot_be_used_are_named(
     assert main([*asked, str(tmp_path / "nowhere")]) == 2
     assert "nowhere: expected a folder with config.json, or a model of the" in capsys.readouterr().err
     assert not (measured / LEARNED_FOLDER).exists()
-    folder = saved_depth_model(tmp_path / "without weights")
-    os.remove(folder / "model.safetensors")
-    assert main([*asked, str(folder)]) == 2
-    assert "expected weights of the model" in capsys.readouterr().err
+    folder = saved_depth_model(tmp_path / "incomplete")
     os.remove(folder / "preprocessor_config.json")
     assert main([*asked, str(folder)]) == 2
-    assert "expected preprocessor_config.json beside the model" in capsys.readouterr().err
+    assert "expected preprocessor_config.json next to the model" in capsys.readouterr().err
+    os.remove(folder / "model.safetensors")
+    assert main([*asked, str(folder)]) == 2
+    assert "expected a model that estimates depth, and its weights" in capsys.readouterr().err
 
 
 def test_transformers_is_asked_for(measured: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

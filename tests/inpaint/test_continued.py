@@ -18,6 +18,7 @@ from arbiview_aug.inpaint.continued import Continue, Mean, fill_holes, object_co
 from arbiview_aug.inpaint.inpainter import Inpainter, Telea
 from arbiview_aug.render.paint_kernels import find_paint
 from arbiview_aug.render.plan import OBJECT, OCCLUDED, Paint
+from arbiview_aug.render.rendered import Views
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import PARTS, TOP_PART
 from tests.helpers import camera, ring, street_sample
@@ -40,6 +41,16 @@ def gradient(height: int, width: int) -> torch.Tensor:
     """(1, 3, h, w) uint8, brighter from row to row."""
     rows = torch.linspace(40, 200, height).round().to(torch.uint8)
     return rows[:, None].expand(1, 3, height, width).contiguous()
+
+
+def fill_hole(
+    view: torch.Tensor, seen: torch.Tensor, seen_by: Camera | None = None, **plan: np.ndarray | Paint
+) -> torch.Tensor:
+    """A view with its hole filled by what is known of it: ``layers``, ``paint`` and ``road`` as in ``ViewPlan``."""
+    rig = Rig([camera(size=tuple(seen.shape)) if seen_by is None else seen_by])
+    parts: dict[str, Any] = {name: [value] for name, value in plan.items()}
+    (out,) = fill_holes(Views([view * seen], rig, [seen], **parts))
+    return out
 
 
 # --- what is filled, and how ------------------------------------------------------------------------------------------
@@ -96,7 +107,7 @@ def test_holes_have_the_detail_of_their_border_but_not_that_of_objects() -> None
     seen, layers = torch.ones(640, 640, dtype=torch.bool), np.zeros((640, 640), np.uint8)
     seen[:, 300:310], layers[:, 310:340] = False, OBJECT
     view[:, :, 310:340] = 0
-    (out,) = fill_holes([view * seen], [seen], [layers])
+    out = fill_hole(view, seen, layers=layers)
     contrast = out[0, ::2].float().mean(0) - out[0, 1::2].float().mean(0)
     assert contrast[300] > 100 and contrast[309] > 30 and (contrast[301:310] < contrast[300:309]).all()
     assert out[0, :, 300:310].float().mean(0).sub(120).abs().max() < 2 and torch.equal(out[:, seen], view[:, seen])
@@ -181,8 +192,9 @@ def test_any_size_and_any_hole_is_filled(size: tuple[int, int]) -> None:
     for share in (0.0, 0.01, 0.5, 0.99, 1.0):
         seen = torch.from_numpy(rng.random(size) < share)
         view = torch.full((3, *size), 77, dtype=torch.uint8) * seen
-        for layers in (None, (~seen).numpy().view(np.uint8), rng.integers(0, 3, size, np.uint8)):
-            (out,) = fill_holes([view.clone()], [seen], [layers], [None])
+        layers = (~seen).numpy().view(np.uint8), rng.integers(0, 3, size, np.uint8)
+        for plan in ({}, *({"layers": of_view} for of_view in layers)):
+            out = fill_hole(view, seen, **plan)
             assert (out[:, ~seen] == (77 if seen.any() else 128)).all() and (out[:, seen] == 77).all()
 
 
@@ -193,7 +205,7 @@ def test_the_nearer_side_is_never_smeared_into_what_it_hides() -> None:
     layers = np.zeros((64, 96), np.uint8)
     layers[30:, 20:70], layers[10:30, 20:70] = OBJECT, OCCLUDED
     seen = torch.from_numpy(layers != OCCLUDED)
-    (out,) = fill_holes([view * seen], [seen], [layers], [None])
+    out = fill_hole(view, seen, layers=layers)
     assert torch.equal(out[:, seen], view[:, seen]) and ((out[:, ~seen].int() - 120).abs() <= 1).all()
 
 
@@ -214,8 +226,8 @@ def test_lane_marks_go_on_along_the_heading(lens: str, distortion: tuple[float, 
     seen = torch.ones((128, 160), dtype=torch.bool)
     seen[104:] = False
     truth = view[0, 104:].float()
-    (out,) = fill_holes([view * seen], [seen], cameras=[viewpoint])
-    (columns,) = fill_holes([view * seen], [seen])
+    out = fill_hole(view, seen, viewpoint)
+    columns = fill_hole(view, seen, viewpoint, road=np.zeros((33, 41), bool))
     errors = [(filled[0, 104:].float() - truth).square().mean() for filled in (out, columns)]
     assert (truth > 200).any() and errors[0] < errors[1] / 3
 
@@ -227,9 +239,7 @@ def test_posts_go_on_vertically_and_joints_of_the_road_along_the_heading() -> No
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[56:] = False
     nodes = np.zeros((17, 17), bool)
-    (wall,), (road,) = (
-        fill_holes([view * seen], [seen], road=[on_road], cameras=[viewpoint]) for on_road in (nodes, ~nodes)
-    )
+    wall, road = (fill_hole(view, seen, viewpoint, road=on_road) for on_road in (nodes, ~nodes))
     # The lines of the road start at the middle of the image: that through (45.5, 55.5) is at 49.8 in the row 62.5.
     assert wall[0, 62, 45] > wall[0, 62, 50] + 20 and road[0, 62, 50] > road[0, 62, 45] + 20
 
@@ -325,10 +335,7 @@ def objects(*painted: tuple[Any, int, Any], hidden: Any = (), parts: np.ndarray 
 
 def filled(view: torch.Tensor, seen: torch.Tensor, paint: Paint, layer: int = OBJECT) -> torch.Tensor:
     """The view, all of whose pixels are objects, or whose unseen ones are of another layer."""
-    (out,) = fill_holes(
-        [view.clone()], [seen], [np.where(seen | (layer == OBJECT), OBJECT, layer).astype(np.uint8)], [paint]
-    )
-    return out
+    return fill_hole(view, seen, layers=np.where(seen | (layer == OBJECT), OBJECT, layer).astype(np.uint8), paint=paint)
 
 
 BOX, TOP = np.s_[20:50, 4:28], np.s_[10:20, 4:28]
@@ -390,7 +397,7 @@ def test_objects_that_nobody_sees_are_background() -> None:
     view, seen, paint = objects((np.s_[20:50, 10:30], 0, 10), (behind, 6, 9), hidden=[behind])
     layers = np.zeros(seen.shape, np.uint8)
     layers[20:50, 10:44] = OBJECT
-    (out,) = fill_holes([view], [seen], [layers], [paint])
+    out = fill_hole(view, seen, layers=layers, paint=paint)
     assert (out[:, 22:48, 31:42].float() - 200).abs().max() <= 1
 
 

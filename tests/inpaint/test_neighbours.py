@@ -102,7 +102,7 @@ def test_gradients_reach_the_current_images(sample: dict[str, Any]) -> None:
 def test_explain_lists_each_neighbour(sample: dict[str, Any], alone: dict[str, Any], filled: dict[str, Any]) -> None:
     explanation = RigRetarget(low()).explain(sample)
     assert isinstance(explanation, Explanation) and explanation.fills is not None
-    shares = explanation.fills.shares(explanation.plan)
+    shares, _ = explanation.fills.shares(explanation.plan)
     gained = (filled["coverage"] & ~alone["coverage"]).double().mean((1, 2)).tolist()
     assert all(up_to >= share for up_to, share in zip(shares, gained, strict=True)) and sum(shares) < 1.3 * sum(gained)
     assert str(explanation).count("m of travel: ") == 4 and "more by other frames of the drive" in str(explanation)

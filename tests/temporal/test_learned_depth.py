@@ -12,7 +12,7 @@ import torch
 
 from arbiview_aug import Rig
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig
-from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, View, fit_depth, learned_depth
+from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, fit_depth, learned_depth
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.helpers import camera
 
@@ -35,17 +35,13 @@ class Oracle:
     revision = "1"
     licence = "mit"
 
-    def predict(self, views: Sequence[View]) -> list[np.ndarray]:
-        self.batches = [*getattr(self, "batches", []), len(views)]
-        predictions = []
-        for view in views:
-            seen = (
-                self.truth[view.image.numpy().tobytes()]
-                * (self.assumed_px or float(view.pinhole.K[0, 0]))
-                / float(view.pinhole.K[0, 0])
-            )
+    def predict(self, images: Sequence[torch.Tensor]) -> list[np.ndarray]:
+        self.batches = [*getattr(self, "batches", []), len(images)]
+        predictions, focal_px = [], float(RIG[0].K[0, 0])
+        for image in images:
+            seen = self.truth[image.numpy().tobytes()] * (self.assumed_px or focal_px) / focal_px
             predictions.append(self.form(seen).astype(np.float32))
-            view.image.zero_()  # a copy: the truth knows the images by their bytes
+            image.zero_()  # a copy: the truth knows the images by their bytes
         return predictions
 
 
@@ -161,11 +157,11 @@ def test_fisheye_images_are_shown_as_pinhole_ones() -> None:
     seen: list[torch.Tensor] = []
 
     class Road(Oracle):
-        def predict(self, views: Sequence[View]) -> list[np.ndarray]:
-            seen.extend(view.image for view in views)
+        def predict(self, images: Sequence[torch.Tensor]) -> list[np.ndarray]:
+            seen.extend(images)
             rays, _ = lens.undistorted().unproject(lens.pixel_grid())
             inverse = np.maximum(-rays[..., 2] / 1.5 / rays[..., 0], 0.0)
-            return [inverse.astype(np.float32) for _ in views]
+            return [inverse.astype(np.float32) for _ in images]
 
     image = torch.rand(3, 96, 128)
     depth, (fit,) = depth_of(Road({}, lambda z: z, "inverse"), DepthInputs(Rig([lens]), [image]))
