@@ -35,9 +35,17 @@ from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame, retargeting, scores, without_masks
-from arbiview_aug.evaluate.held_out import held_out
-from arbiview_aug.evaluate.metrics import mean_of
+from arbiview_aug.evaluate.frames import (
+    LidarReference,
+    ScoredFrame,
+    make_frame,
+    photographed,
+    retargeting,
+    scores,
+    without_masks,
+)
+from arbiview_aug.evaluate.held_out import WithoutCamera
+from arbiview_aug.evaluate.metrics import as_arrays, mean_of
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
@@ -106,7 +114,9 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         if "points" not in sample:
             if len(sample["rig"]) < 2:
                 raise DataError(f"data {arguments.data}: expected LiDAR points or several cameras, to score by")
-            return [held_out(sample, place, reference) for place in range(len(sample["rig"]))]
+            cameras = zip(reference["rig"], as_arrays(reference["images"]), strict=True)
+            road = reference["rig"].ground_z_m
+            return [photographed(WithoutCamera(sample, k), *truth, road) for k, truth in enumerate(cameras)]
         frame, points = (
             make_frame(each, exposures=("even",), hand_over_points=True).lidar["even"] for each in (sample, reference)
         )

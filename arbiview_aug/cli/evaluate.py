@@ -34,8 +34,8 @@ from arbiview_aug.evaluate.frames import (
     make_frame,
     retargeting,
 )
-from arbiview_aug.evaluate.held_out import CommonPixels, held_out_frames, render_alone, surfaces_for
-from arbiview_aug.evaluate.judges import TOO_FEW, Panel, Segmenter, load_detector, load_segmenter, too_few
+from arbiview_aug.evaluate.held_out import common_scores, held_out_frames, photograph_tables, surfaces_for
+from arbiview_aug.evaluate.judges import TOO_FEW, Panel, Segmenter, load_detector, load_segmenter
 from arbiview_aug.evaluate.report.tables import evaluation_table, html_report, text_table, verdict_tables
 from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
@@ -51,9 +51,9 @@ def run(arguments: argparse.Namespace) -> None:
         load_segmenter(arguments.segmenter) if arguments.segmenter else None,
     )
     look = panel.look if arguments.detector or arguments.segmenter else None
-    common = CommonPixels(look, arguments.held_out == ["holes"]) if arguments.held_out else None
-    if common is not None:
-        methods, done = _held_out(arguments, notes, common, panel.segmenter)
+    in_holes = arguments.held_out == ["holes"]
+    if arguments.held_out:
+        methods, done = _held_out(arguments, notes, look, panel.segmenter, in_holes)
     else:
         methods, data = _methods(arguments), open_frames(arguments, arguments.geometry)
         done = measured(arguments, data, methods, notes, look)
@@ -62,18 +62,19 @@ def run(arguments: argparse.Namespace) -> None:
         raise DataError("; ".join(done.declined.values()))
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     complete = [name for name in names if name not in done.declined]  # judged on all frames
-    verdicts, rows = panel.rows(complete), done.views if common is None else common.rows
-    tables = [evaluation_table(done, names)] if common is None else common.tables(complete)
+    verdicts, tables = panel.rows(complete), [evaluation_table(done, complete)]
+    if arguments.held_out:
+        tables = photograph_tables(done.views, complete, in_holes=in_holes)
     tables += verdict_tables(verdicts)
-    if too_few(verdicts.values()):
+    if any(row.get("objects", 100) < 100 or row.get("images", 10) < 10 for row in verdicts.values()):
         notes.append(TOO_FEW)
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
-    title = f"{source}: {frames_text(len({row['frame'] for row in rows}))}"
+    title = f"{source}: {frames_text(len({row['frame'] for row in done.views}))}"
     for note in notes:
         print(f"note: {note}\n")
     print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
     report: dict[str, Any] = {"arguments": vars(arguments), "scored_on_other_points": done.first.held_out}
-    report |= {"means": tables[0][1], "views": rows} | ({"judges": verdicts} if verdicts else {})
+    report |= {"means": tables[0][1], "views": done.views} | ({"judges": verdicts} if verdicts else {})
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
     page = html_report(title, done, names, tables, notes)
     (folder / "report.html").write_text(page, encoding="utf-8")
@@ -102,10 +103,10 @@ def measured(
 
 
 def _held_out(
-    arguments: argparse.Namespace, notes: list[str], common: CommonPixels, segmenter: Segmenter | None
+    arguments: argparse.Namespace, notes: list[str], look: Look | None, segmenter: Segmenter | None, in_holes: bool
 ) -> tuple[list[Method], Evaluation]:
     """Evaluate the surfaces on held-out photographs, or fillers on held-out holes; no neighbour fills."""
-    asked, place_of = arguments.held_out, load_rig(arguments.target or REAL_TARGET) if common.in_holes else None
+    asked, place_of = arguments.held_out, load_rig(arguments.target or REAL_TARGET) if in_holes else None
     everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
     data = open_frames(arguments, [*arguments.geometry, *([everything] if place_of is None else [])])
     chosen = chosen_frames(arguments.frames or len(data), len(data))
@@ -121,8 +122,9 @@ def _held_out(
         def step(name: str, steps: int) -> None:
             tick(name, views * steps)
 
-        done = evaluate(chain([first], frames), lambda rig: rig, methods, step, common.look, render_alone)
-    common.finish()
+        compare = partial(common_scores, in_holes=in_holes)
+        done = evaluate(chain([first], frames), lambda rig: rig, methods, step, look, compare)
+    notes[:] = [note for note in notes if not note.startswith("the target rig ")]  # tables show what is seen
     return methods, done
 
 

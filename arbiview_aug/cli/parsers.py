@@ -7,19 +7,10 @@ import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
 
+from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import Quality, Reduce
-from arbiview_aug.cli.arguments import (
-    LIDAR,
-    READING,
-    RENDERING,
-    add_options,
-    command_parser,
-    is_rig,
-    kinds_text,
-    options,
-    path,
-)
+from arbiview_aug.choices import TRAINING_PRESETS, GeometryName, Holes, Quality, Reduce, Reference
+from arbiview_aug.cli.arguments import REAL_TARGET, count, data, is_rig, pair, path, seed, size
 from arbiview_aug.datasets.registry import READERS
 
 SIZE, FULL_SIZE = (256, 704), (900, 1600)
@@ -28,8 +19,106 @@ SIZE, FULL_SIZE = (256, 704), (900, 1600)
 SCORED = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
 """Geometry that ``bench`` scores, and the sample key that offers it."""
 
-_DATA, _RENDERING, _READING = options()["--data"], " ".join(RENDERING), " ".join(READING)
-_EVALUATED = "fast", "auto", "black"  # defaults of ``RENDERING`` in tables
+_KINDS = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
+_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_TARGET = f"(default: a higher five-camera rig; of real frames, {REAL_TARGET})"
+
+_OPTIONS: dict[str, dict[str, Any]] = {
+    flag: {
+        "default": default,
+        "help": text,
+        **({"choices": kind} if isinstance(kind, tuple) else {"type": kind, "metavar": metavar}),
+    }
+    for flag, kind, metavar, default, text in (
+        ("--data", data, "[KIND:]PATH", None, f"real frames, by their path alone or with their kind. {_KINDS}"),
+        ("--target", path, "RIG", None, f"rig to render: {', '.join(shipped_rigs())}, or a file {_TARGET}"),
+        ("--output", path, "DIR", "output", "folder to write to"),
+        ("--quality", get_args(Quality), None, "fast", "renderer preset; paper: the published stages, without lenses"),
+        ("--geometry", get_args(GeometryName), None, "auto", "scene geometry; auto: the best that the data offers"),
+        ("--holes", get_args(Holes), None, "continue", "what fills holes (docs/holes.md)"),
+        ("--generator", path, "PATH", None, "of --holes diffusion: folder, TorchScript file or OWNER/NAME on the Hub"),
+        ("--frames", count, "N", 1, "number of frames"),
+        ("--seed", seed, "N", 0, "seed of the synthetic streets"),
+        ("--size", size, "HxW", None, "cut the target to this height and width (default: its own; synthetic: 256x704)"),
+        ("--downscale", get_args(Reduce), None, 1, "decode images at 1/N of their size"),
+        ("--lidar-channel", path, "NAME", None, "nuScenes: the LiDAR to read (default: LIDAR_TOP, or the only one)"),
+        ("--lidar-columns", str, "NAME", None, "nuScenes: columns of LiDAR files without a header (docs/formats.md)"),
+        ("--workers", count, "N", _CORES, "processes or actors (default: one a core)"),
+        # convert
+        ("--version", path, "NAME", None, "nuScenes' folder of tables (default: v1.0-mini, -trainval)"),
+        ("--names", pair, "OLD=NEW", [], "new names of the target's cameras, such as ring_front_center=CAM_FRONT"),
+        ("--fit", get_args(Fit), None, "crop", "with --size: cut top and sides (default), pad in black, or stretch"),
+        ("--points", ("target", "source"), None, "target", "by the target's scanners (default), or as recorded"),
+        ("--neighbours", seed, "N", 0, "let N frames of the drive before and after each fill holes (default: none)"),
+        ("--depth", path, "DIR", None, "what the depth command wrote (default: its folder in the data; auto: none)"),
+        ("--images", ("jpg", "png"), None, "jpg", "jpg: quality 96, 4:4:4; png: lossless"),
+        ("--shard-index", seed, "I", 0, "this shard, from 0"),
+        ("--num-shards", count, "N", 1, "number of shards"),
+        ("--runner", ("local", "ray"), None, "local", "processes here, or Ray actors"),
+        ("--on-error", ("report", "skip"), None, "report", "bad samples: do not finish (default), or leave them out"),
+        ("--report", seed, "N", 0, "frames to score and show in conversion/report.html of the output (default: 0)"),
+        # demo, depth, evaluate, train
+        ("--width", count, "PX", 1800, "width of the contact sheet"),
+        ("--model", path, "ID_OR_PATH", None, "depth model of transformers: a folder, or a name on its Hub"),
+        ("--batch", count, "N", 8, "images that the model sees at once"),
+        ("--reference", get_args(Reference), None, None, "what a model's depth is fitted to, the first that there is"),
+        (
+            "--held-out",
+            str,
+            "CAMERA",
+            None,
+            "score by these cameras' photographs (all: each), rendered from the others; next: by that of the frames' "
+            "`truth` camera, else by the next frame's; holes: score --holes in those that --target's place would leave",
+        ),
+        ("--detector", path, "MODEL", None, "FILE.py:function (docs/benchmarks.md): AP and recall of its boxes"),
+        ("--segmenter", path, "MODEL", None, "FILE.py:function (docs/benchmarks.md): IoU of its masks"),
+        ("--config", TRAINING_PRESETS, None, "compact", "preset of all settings"),
+        ("--set", str, "KEY=VALUE", [], "a setting, such as steps=100 or loss.geo=0"),
+        ("--weights", path, "DIR", None, "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model"),
+        ("--vgg-weights", path, "FILE", None, "torchvision's vgg16 weights (default: cache or download)"),
+    )
+}
+"""Options of the commands as argparse takes them, by flag: from type or choices, metavar, default and text."""
+
+_OPTIONS |= {
+    flag: {"action": "store_true", "help": text}
+    for flag, text in (
+        ("--clean-masks", "clean specks from frame folders' masks, mask fisheyes' dark rims"),
+        ("--common", "propose one rig for all: pinhole cameras whose views each of the rigs sees"),
+        ("--quiet", "no progress bars"),
+    )
+}
+for _flag in ("--lidar-columns", "--names", "--held-out"):
+    _OPTIONS[_flag]["nargs"] = "+"
+_OPTIONS["--reference"] |= {"nargs": "+", "default": [*get_args(Reference)]}
+_OPTIONS["--set"]["action"] = "append"
+_OPTIONS["--downscale"] |= {"dest": "reduce", "type": int}
+_OPTIONS["--depth"]["dest"] = "motion_depth"
+
+_LIDAR, _READING = "--lidar-channel --lidar-columns", "--downscale --clean-masks --lidar-channel --lidar-columns"
+_RENDERING = "--quality --geometry --holes"
+
+
+def command_parser(program: str, description: str, example: str) -> argparse.ArgumentParser:
+    """Create a parser without its options; ``example`` shows typical arguments."""
+    return argparse.ArgumentParser(prog=program, description=description, epilog=f"example: {program} {example}")
+
+
+def add_options(parser: argparse.ArgumentParser, *flags: str, without: str = "", **changes: Any) -> None:
+    """Add options; ``changes`` replace entries of ``_OPTIONS``. Help texts end in the default, ``without`` in words."""
+    for flag in flags:
+        option = {**_OPTIONS.get(flag, {}), **changes}
+        default = option.get("default")
+        if option.get("required"):
+            option["help"] = option["help"].partition(" (default")[0]
+        elif flag.startswith("-") and (without or (default and "default" not in option["help"])):
+            values = default if isinstance(default, list) else [default]
+            texts = ["x".join(map(str, value)) if isinstance(value, tuple) else str(value) for value in values]
+            option["help"] += f" (default: {without or ' '.join(texts)})"
+        parser.add_argument(flag, **option)
+
+
+_SCORED = "surfaces to score (default: all that the samples offer)"
 _CHECKED = "real frames, by their path alone or with their kind; a rig file or a calibration"
 _TRAINED = f"synthetic, or real frames: {' or '.join(f'{kind}:PATH' for kind in READERS)} (default: synthetic)"
 _RIGS = (
@@ -45,7 +134,7 @@ class Command(NamedTuple):
     module: str
     description: str  # up to its first colon it is the command's summary
     example: str
-    options: Sequence[tuple[str, dict[str, Any]]]  # flags, and what differs from ``arguments.options``
+    options: Sequence[tuple[str, dict[str, Any]]]  # flags, and what differs from ``_OPTIONS``
     resumable: bool = False
 
 
@@ -56,11 +145,12 @@ COMMANDS = {
         "--data FOLDER --target waymo",
         [
             ("--data", {"required": True}),
-            ("--target --output", {}),
+            ("--target", {}),
+            ("--output", {"help": "folder for pareto.json"}),
             ("--size", {"default": SIZE, "help": "of every view"}),
             ("--frames", {"help": "frames for accuracy"}),
             ("--quality", {"nargs": "+", "default": [*get_args(Quality)], "help": "presets"}),
-            ("--geometry", {"nargs": "+", "choices": [*SCORED], "default": None, "without": "what the samples offer"}),
+            ("--geometry", {"nargs": "+", "choices": [*SCORED], "default": None, "help": _SCORED}),
             ("--downscale", {"nargs": "+", "default": [*get_args(Reduce)]}),
         ],
     ),
@@ -70,7 +160,7 @@ COMMANDS = {
         "the own car, K of another resolution, specks in masks, unread keys. Draws boxes and points into the images.",
         "/data/frames --frames 5",
         [
-            ("data", {"type": path, "metavar": "[KIND:]PATH", "help": f"{_CHECKED}. {kinds_text()}"}),
+            ("data", {"type": path, "metavar": "[KIND:]PATH", "help": f"{_CHECKED}. {_KINDS}"}),
             ("--frames", {"default": 3, "help": "number of frames, spread over the data"}),
             (_READING, {}),
             ("--output", {"help": "folder for the pictures"}),
@@ -99,7 +189,7 @@ COMMANDS = {
         [
             ("--data", {"without": "a synthetic street"}),
             ("--output", {"help": "folder for demo.png, or a picture file ending in .png or .jpg"}),
-            (f"--target {_RENDERING} --frames --seed --size {' '.join(LIDAR)} --width", {}),
+            (f"--target {_RENDERING} --frames --seed --size {_LIDAR} --width", {}),
         ],
     ),
     "depth": Command(
@@ -111,7 +201,7 @@ COMMANDS = {
             ("--data", {"required": True}),
             ("--output", {"default": None, "help": "(default: motion_depth or learned_depth in the data)"}),
             ("--workers", {"default": 1, "help": "processes"}),
-            (f"--model --batch --reference {' '.join(LIDAR)}", {}),
+            (f"--model --batch --reference {_LIDAR}", {}),
         ],
         resumable=True,
     ),
@@ -129,15 +219,11 @@ COMMANDS = {
         [
             ("--data", {"without": "synthetic streets"}),
             ("--target", {}),
-            *((flag, {"nargs": "+", "default": [name]}) for flag, name in zip(RENDERING, _EVALUATED, strict=True)),
+            ("--quality", {"nargs": "+", "default": ["fast"]}),
+            ("--geometry", {"nargs": "+", "default": ["auto"]}),
+            ("--holes", {"nargs": "+", "default": ["black"]}),
             ("--frames", {"default": None, "help": "spread over the data (default: 1; --held-out: all)"}),
-            (f"--generator --seed --size {_READING} --output", {}),
-            ("--detector --segmenter", {}),
-            ("--held-out", {"nargs": "+"}),
-            (
-                "--displaced",
-                {"dest": "held_out", "action": "store_const", "const": ["next"], "help": "--held-out next"},
-            ),
+            (f"--generator --seed --size {_READING} --output --detector --segmenter --held-out", {}),
         ],
     ),
     "inspect": Command(
@@ -170,7 +256,7 @@ COMMANDS = {
         "source images next to the target's views, their coverage and confidence. Needs the extra viewer.",
         "/data/frames --target waymo --frames 10",
         [
-            ("data", _DATA),
+            ("data", _OPTIONS["--data"]),
             ("--frames", {"default": 5}),
             (f"--target {_RENDERING} --size {_READING}", {}),
             ("--output", {"default": "output/view.rrd", "metavar": "FILE", "help": "recording to write"}),
@@ -182,8 +268,8 @@ COMMANDS = {
 def parser_of(name: str) -> argparse.ArgumentParser:
     """Create the parser of a command."""
     command = COMMANDS[name]
-    program = ("python -m arbiview_aug.train", "") if name == "train" else ("python -m arbiview_aug", name)
-    parser = command_parser(program[1], command.description, command.example, program[0])
+    program = "python -m arbiview_aug.train" if name == "train" else f"python -m arbiview_aug {name}"
+    parser = command_parser(program, command.description, command.example)
     for flags, changes in command.options:
         add_options(parser, *flags.split(), **changes)
     if name == "demo":

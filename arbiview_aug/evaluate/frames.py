@@ -38,8 +38,8 @@ _CACHED_TRANSFORMS = 8  # targets of a study; full-size plans take 50 MB each
 
 Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]  # a view for each of the target rig
 
-Look = Callable[[str, "ScoredFrame", str, Rig, Sequence[RenderedView]], None]
-"""Look at a named frame's views for a rig, by the method of a name."""
+Look = Callable[["ScoredFrame", str, Rig, Sequence[RenderedView]], None]
+"""Look at a frame's views for a rig, by the method of a name."""
 
 Exposure = Literal["raw", "even"]
 EXPOSURES: tuple[Exposure, ...] = ("raw", "even")  # exposures as recorded, and made even
@@ -116,16 +116,17 @@ class ScoredFrame:
 
 
 def photographed(
-    sample: Mapping[str, Any], rig: Rig, images: Sequence[Image], regions: Sequence[Mapping[str, BoolArray]] = ()
+    sample: Mapping[str, Any], camera: Camera, photograph: Image, ground_z_m: float, *regions: Mapping[str, BoolArray]
 ) -> ScoredFrame:
-    """Frame whose truth are photographs of the cameras of ``rig``, in its ego frame, outside of their masks."""
-    truth = Truth(images, scene_masks(rig), regions)
-    return ScoredFrame(sample, truth=lambda _: truth, target=without_masks(rig))
+    """Frame whose truth is a camera's photograph, outside of its mask; ``regions`` as of ``Truth``."""
+    truth, target = Truth([photograph], [scene_mask(camera)], regions), replace(camera, mask=None)
+    rig = Rig([target], name=camera.name, ground_z_m=ground_z_m)
+    return ScoredFrame(sample, truth=lambda _: truth, target=rig)
 
 
-def scene_masks(rig: Rig) -> list[BoolArray]:
-    """(h, w) pixels of each camera that show no car body."""
-    return [np.ones(camera.size, bool) if camera.mask is None else camera.mask for camera in rig]
+def scene_mask(camera: Camera) -> BoolArray:
+    """(h, w) pixels of a camera that show no car body."""
+    return np.ones(camera.size, bool) if camera.mask is None else camera.mask
 
 
 def without_masks(rig: Rig) -> Rig:
@@ -227,30 +228,38 @@ def evaluate(
     methods: Sequence[Method],
     tick: Callable[[str, int], None] = lambda _, __: None,
     look: Look | None = None,
-    score: Callable[[ScoredFrame, Render, Rig], tuple[list[RenderedView], list[dict[str, float]]]] = scores,
+    compare: Callable[[str, ScoredFrame, Mapping[str, Sequence[RenderedView]]], list[dict[str, Any]]] | None = None,
 ) -> Evaluation:
     """Run every method on every named frame, for its ``target`` or that of its rig; DataError without frames.
 
     ``tick`` is called before each step with its name and the frame's number of steps. ``look`` sees all views.
+    ``compare`` gives the rows of a frame's views by all methods, in place of ``scores`` of each method.
     """
     done: Evaluation | None = None
     for name, frame in frames:
         rig = frame.target or target(frame.sample["rig"])
+        label = name if frame.target is None else f"{name}: {rig.name}"
         if done is None:
             done = Evaluation(frame, rig, rig.name or "target" if frame.target is None else "photographs")
+        shown: dict[str, list[RenderedView]] = {}
         for method in methods:
-            tick(f"{name}: {method.name}", len(methods))
+            tick(f"{label}: {method.name}", len(methods))
             try:
-                views, rows = score(frame, method.render, rig)
+                if compare is None:
+                    shown[method.name], rows = scores(frame, method.render, rig)
+                    where = {"frame": name, "method": method.name, "target": done.label}
+                    done.views += [{**where, "camera": c.name, **row} for c, row in zip(rig, rows, strict=True)]
+                else:
+                    shown[method.name] = method.render(frame.sample, rig)
             except (CalibrationError, SampleError) as error:  # lenses, for a method of pinhole cameras
-                done.declined[method.name] = f"frame {name}: {error}"
+                done.declined[method.name] = f"frame {label}: {error}"
                 continue
-            if frame is done.first:
-                done.pictures[method.name] = views
             if look is not None:
-                look(name, frame, method.name, rig, views)
-            where = {"frame": name, "method": method.name, "target": done.label}
-            done.views += [{**where, "camera": c.name, **row} for c, row in zip(rig, rows, strict=True)]
+                look(frame, method.name, rig, shown[method.name])
+        if compare is not None and shown:
+            done.views += compare(name, frame, shown)
+        if frame is done.first:
+            done.pictures = shown
     if done is None:
         raise DataError("expected a frame to evaluate, found none")
     return done

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -18,11 +18,11 @@ from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.errors import DataError, warn
-from arbiview_aug.evaluate.frames import Look, Render, ScoredFrame, Truth, photographed, scene_masks, without_masks
+from arbiview_aug.evaluate.frames import ScoredFrame, photographed, scene_mask, without_masks
 from arbiview_aug.evaluate.judges import Segmenter, draws_of, interval
 from arbiview_aug.evaluate.lidar import visible_points
 from arbiview_aug.evaluate.metrics import RenderedView, as_arrays, errors, mean_of, ssim_map, to_bytes
-from arbiview_aug.evaluate.report.tables import Table
+from arbiview_aug.evaluate.report.tables import Columns, Table
 from arbiview_aug.sample.boxes_2d import rig_of
 from arbiview_aug.sample.frame import Frame, Neighbour
 from arbiview_aug.sample.inputs import DEPTH_KEYS, LEARNED_KEY, read_frames
@@ -52,14 +52,14 @@ HOLE_NOTES = (
     "cameras and frames; gradients: as a share of the photographs'. difference: PSNR to the first row, with a 95 % "
     "interval, bootstrap over frames. Frames of one drive are alike."
 )
-_COLUMNS = (
+_COLUMNS: Columns = (
     ("seen", "{seen:.1%}"),
     ("PSNR dB", "{psnr_db:.2f}"),
     ("one gain", "{gain_psnr_db:.2f}"),
     ("difference", "{difference_db:+.2f} [{difference_db_low:+.2f}, {difference_db_high:+.2f}]"),
     ("SSIM", "{ssim:.4f}"),
 )
-_HOLE_COLUMNS = (_COLUMNS[1], *_COLUMNS[3:], ("gradients", "{gradients:.0%}"))
+_HOLE_COLUMNS: Columns = (_COLUMNS[1], *_COLUMNS[3:], ("gradients", "{gradients:.0%}"))
 
 
 class WithoutCamera(Mapping[str, Any]):
@@ -96,7 +96,7 @@ def held_out_frames(
     segmenter: Segmenter | None = None,
     place_of: Rig | None = None,
 ) -> Iterator[tuple[str, ScoredFrame]]:
-    """Name and frame of each held-out camera (``all``: of every camera) of the samples at ``indices``.
+    """Frame's name, inputs and truth of each held-out camera (``all``: of every camera) of the samples at ``indices``.
 
     ``["next"]`` holds out a ``FrameFolder``'s ``truth`` camera, else the cameras of the nearest neighbour recorded
     later. With ``place_of`` they are all cameras that have holes from the places of that rig's cameras, as sources too.
@@ -131,8 +131,7 @@ def held_out_frames(
             masks = () if segmenter is None else segmenter(to_bytes(photograph))
             regions = {f"mask {k}": mask for k, mask in enumerate(masks, 1)}
             regions |= {} if points is None or classes is None else _windows(camera, points, classes)
-            target = Rig([camera], name=camera.name, ground_z_m=rig.ground_z_m)
-            yield f"{frame}: {camera.name}", photographed(inputs, target, [photograph], [regions])
+            yield frame, photographed(inputs, camera, photograph, rig.ground_z_m, regions)
         count += len(views)
     if cameras == ["next"] and not count:
         raise DataError(problems[0] if problems else NO_PHOTOGRAPH)
@@ -181,25 +180,13 @@ def surfaces_for(sample: Mapping[str, Any]) -> list[GeometryName]:
     return names + measured + ((["motion", "fused"] if measured else ["motion"]) if sample.get("neighbours") else [])
 
 
-def held_out(sample: Mapping[str, Any], place: int, reference: Mapping[str, Any]) -> ScoredFrame:
-    """A sample without one of its cameras, whose photograph in ``reference``, perhaps of another size, is the truth."""
-    camera: Camera = reference["rig"][place]
-    target = Rig([camera], name=camera.name, ground_z_m=reference["rig"].ground_z_m)
-    return photographed(WithoutCamera(sample, place), target, as_arrays([reference["images"][place]]))
-
-
-def render_alone(frame: ScoredFrame, render: Render, target: Rig) -> tuple[list[RenderedView], list[dict[str, float]]]:
-    """Views without scores, for ``evaluate``: ``CommonPixels`` scores them once all methods' are there."""
-    return render(frame.sample, target), [{} for _ in target]
-
-
 def _with_holes(sample: Mapping[str, Any], rig: Rig, target: Rig) -> tuple[dict[str, Any], list[BoolArray]]:
     """Sample whose cameras do not see the holes (h, w) that they would have at the centres of the target's nearest."""
     centres = [camera.center_m for camera in target.in_frame_of(rig)]
     moved = [camera.shifted(*min(centres - camera.center_m, key=np.linalg.norm)) for camera in rig]
     there = RigRetarget(without_masks(rig.with_cameras(moved)), holes="black", match_exposure=False, neighbours=None)
     seen = [covered.numpy() for covered in there(sample)["coverage"]]
-    pairs = list(zip(seen, scene_masks(rig), strict=True))
+    pairs = list(zip(seen, map(scene_mask, rig), strict=True))
     coverage = [torch.from_numpy(covered & mask) for covered, mask in pairs]
     return {**sample, "coverage": coverage}, [mask & ~covered for covered, mask in pairs]
 
@@ -222,77 +209,58 @@ def _windows(camera: Camera, points: torch.Tensor, classes: npt.NDArray[np.int64
     return regions
 
 
-@dataclass
-class CommonPixels:
-    """Scores of held-out cameras on the pixels that all methods cover; ``look`` is that of ``evaluate``."""
+def common_scores(
+    name: str, frame: ScoredFrame, shown: Mapping[str, Sequence[RenderedView]], *, in_holes: bool = False
+) -> list[dict[str, Any]]:
+    """Score each method's view of a held-out camera on the pixels that all methods cover.
 
-    then: Look | None = None  # looks after it
-    in_holes: bool = False  # score the pixels that no method covers, at their own exposure
-    rows: list[dict[str, Any]] = field(default_factory=list)  # metrics by frame, camera and method
-    _name: str = ""  # of the held-out camera in its frame
-    _place: tuple[str, str] = "", ""  # its frame, and its name alone
-    _truth: Truth | None = None
-    _views: dict[str, RenderedView] = field(default_factory=dict)  # of that camera, by method
+    With ``in_holes`` the pixels that no method covers score, at their own exposure.
+    """
+    assert frame.truth is not None and frame.target is not None
+    (true,), (valid,), (regions,) = frame.truth(frame.target)
+    views = {method: view for method, (view,) in shown.items()}
+    common = valid & np.all([view.coverage != in_holes for view in views.values()], axis=0)
+    rows = []
+    for method, view in views.items():
+        row: dict[str, Any] = {"frame": name, "camera": frame.target[0].name, "method": method}
+        row |= {"seen": float(view.coverage[valid].mean()), "common": float(common[valid].mean())}
+        if common.any():
+            shown_px, true_px = view.image[common].astype(np.float64), true[common].astype(np.float64)
+            gain = 1.0 if in_holes else (shown_px * true_px).sum() / max((shown_px**2).sum(), 1.0)
+            row["psnr_db"] = errors(shown_px, true_px)["psnr_db"]
+            row["gain_psnr_db"] = errors(gain * shown_px, true_px)["psnr_db"]
+            row["ssim"] = float(ssim_map(view.image, true).mean(-1)[common].mean())
+            row["gradients"] = _gradients(view.image, common) / max(_gradients(true, common), 1.0)
+            for region, mask in regions.items():
+                metrics = errors(gain * view.image[common & mask], true[common & mask])
+                row |= {region: metrics["psnr_db"]} if metrics else {}
+        rows.append(row)
+    return rows
 
-    def look(self, name: str, frame: ScoredFrame, method: str, rig: Rig, views: Sequence[RenderedView]) -> None:
-        """Collect a method's view of a held-out camera, and score the views of the camera before it."""
-        if name != self._name:
-            self.finish()
-            self._name, self._truth = name, None if frame.truth is None else frame.truth(rig)
-            self._place = name.removesuffix(f": {rig[0].name}"), rig[0].name
-        self._views[method] = views[0]
-        if self.then is not None:
-            self.then(name, frame, method, rig, views)
 
-    def finish(self) -> None:
-        """Score the last views."""
-        views, truth = self._views, self._truth
-        if truth is None or not views:
-            return
-        true, (valid,), (regions,) = truth.images[0], truth.valid, truth.regions
-        common = valid & np.all([view.coverage != self.in_holes for view in views.values()], axis=0)
-        frame, camera = self._place
-        for method, view in views.items():
-            row = {"frame": frame, "camera": camera, "method": method, "seen": float(view.coverage[valid].mean())}
-            row["common"] = float(common[valid].mean())
-            if common.any():
-                shown, wanted = view.image[common].astype(np.float64), true[common].astype(np.float64)
-                gain = 1.0 if self.in_holes else (shown * wanted).sum() / max((shown**2).sum(), 1.0)
-                row |= {"psnr_db": errors(shown, wanted)["psnr_db"]}
-                row |= {"gain_psnr_db": errors(gain * shown, wanted)["psnr_db"]}
-                row["ssim"] = float(ssim_map(view.image, true).mean(-1)[common].mean())
-                row["gradients"] = _gradients(view.image, common) / max(_gradients(true, common), 1.0)
-                for region, mask in regions.items():
-                    metrics = errors(gain * view.image[common & mask], true[common & mask])
-                    row |= {region: metrics["psnr_db"]} if metrics else {}
-            self.rows.append(row)
-        self._views = {}
-
-    def tables(self, methods: Sequence[str]) -> list[Table]:
-        """Scores by method, and one-gain PSNR by class."""
-        frames = list(dict.fromkeys(row["frame"] for row in self.rows))
-        means, by_frame = {}, {}
-        for method in methods:
-            rows = [row for row in self.rows if row["method"] == method]
-            means[method] = mean_of(rows)
-            frame_means = [mean_of(row for row in rows if row["frame"] == frame) for frame in frames]
-            by_frame[method] = np.array([row.get("gain_psnr_db", np.nan) for row in frame_means])
-        drawn = draws_of(len(frames))
-        for method in methods[1:]:
-            difference = by_frame[method] - by_frame[methods[0]]
-            known = np.isfinite(difference)
-            draws = drawn[:, known] @ difference[known] / np.maximum(drawn[:, known].sum(1), 1)
-            means[method] |= interval("difference_db", draws)
-        title, notes, columns = "Against the photographs of held-out cameras", NOTES, [*_COLUMNS]
-        if self.in_holes:
-            title, notes, columns = "Against the photographs in held-out holes", HOLE_NOTES, [*_HOLE_COLUMNS]
-        if len(frames) == 1:  # one frame has no interval
-            columns = [(name, text.split(" [")[0]) for name, text in columns]
-        notes = notes.format(common=mean_of(self.rows).get("common", 0.0))
-        tables: list[Table] = [(title, means, columns, notes)]
-        regions = {key for row in self.rows for key in row if key.startswith(("class ", "mask "))}
-        if names := sorted(regions, key=lambda name: (name.split()[0], int(name.split()[1]))):
-            columns = [(name, f"{{{name}:.2f}}") for name in names]
-            notes = "PSNR of these pixels (cameras: after one gain), by class of points around or segmenter's mask."
-            tables.append(("The same by class", means, columns, notes))
-        return tables
+def photograph_tables(scored: Sequence[Mapping[str, Any]], methods: Sequence[str], *, in_holes: bool) -> list[Table]:
+    """Tables of ``common_scores`` by method, and of one-gain PSNR by class."""
+    frames = list(dict.fromkeys(row["frame"] for row in scored))
+    means, by_frame = {}, {}
+    for method in methods:
+        rows = [row for row in scored if row["method"] == method]
+        means[method] = mean_of(rows)
+        frame_means = [mean_of(row for row in rows if row["frame"] == frame) for frame in frames]
+        by_frame[method] = np.array([row.get("gain_psnr_db", np.nan) for row in frame_means])
+    drawn = draws_of(len(frames))
+    for method in methods[1:]:
+        difference = by_frame[method] - by_frame[methods[0]]
+        known = np.isfinite(difference)
+        draws = drawn[:, known] @ difference[known] / np.maximum(drawn[:, known].sum(1), 1)
+        means[method] |= interval("difference_db", draws)
+    title, notes, columns = "Against the photographs of held-out cameras", NOTES, _COLUMNS
+    if in_holes:
+        title, notes, columns = "Against the photographs in held-out holes", HOLE_NOTES, _HOLE_COLUMNS
+    if len(frames) == 1:  # one frame has no interval
+        columns = tuple((name, text.split(" [")[0]) for name, text in columns)
+    tables: list[Table] = [(title, means, columns, notes.format(common=mean_of(scored).get("common", 0.0)))]
+    regions = {key for row in scored for key in row if key.startswith(("class ", "mask "))}
+    if names := sorted(regions, key=lambda name: (name.split()[0], int(name.split()[1]))):
+        notes = "PSNR of these pixels (cameras: after one gain), by class of points around or segmenter's mask."
+        tables.append(("The same by class", means, [(name, f"{{{name}:.2f}}") for name in names], notes))
+    return tables

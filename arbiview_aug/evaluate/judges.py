@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +23,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError, one_line, shown
 from arbiview_aug.evaluate.frames import ScoredFrame
-from arbiview_aug.evaluate.metrics import RenderedView, to_bytes
+from arbiview_aug.evaluate.metrics import Image, RenderedView, to_bytes
 from arbiview_aug.evaluate.report.pictures import Picture
 
 
@@ -36,6 +36,11 @@ class Detections(NamedTuple):
     def subset(self, chosen: BoolArray) -> Detections:
         """The detections that a mask (n,) chooses."""
         return Detections(self.boxes[chosen], self.scores[chosen])
+
+    def valid(self, pixels: BoolArray) -> Detections:
+        """The detections whose centres are on valid pixels (h, w)."""
+        x, y = ((self.boxes[:, :2] + self.boxes[:, 2:]) / 2).astype(int).T
+        return self.subset(pixels[y.clip(max=pixels.shape[0] - 1), x.clip(max=pixels.shape[1] - 1)])
 
 
 Detector = Callable[[Picture], Detections]
@@ -58,7 +63,7 @@ def load_detector(name: str) -> Detector:
     detect = _function(option, name)
 
     def detections_of(image: Picture) -> Detections:
-        output = _called(option, detect, image)
+        output = detect(image)
         expected = f"{option}: expected boxes (n, 4) x0 y0 x1 y1 and scores (n,) for an image {image.shape}"
         try:
             boxes, scores = (np.asarray(_host(part)).astype(np.float64) for part in output[:2])
@@ -88,7 +93,7 @@ def load_segmenter(name: str) -> Segmenter:
     segment = _function(option, name)
 
     def masks_of(image: Picture) -> BoolArray:
-        masks = _called(option, segment, image)
+        masks = segment(image)
         try:
             array = np.asarray(_host(masks))
         except (TypeError, ValueError, RuntimeError):
@@ -118,7 +123,7 @@ def _foreign(text: str) -> Iterator[None]:
 
 
 def _function(option: str, name: str) -> Callable[[Picture], Any]:
-    """Import the function that ``FILE.py:function`` names."""
+    """Import the function that ``FILE.py:function`` names; it gets copies of images, since it may write into them."""
     file, _, wanted = name.rpartition(":")
     if not wanted or not file.endswith(".py"):
         raise DataError(f"{option}: expected FILE.py:function, found no function's name; add it, such as own.py:detect")
@@ -133,13 +138,12 @@ def _function(option: str, name: str) -> Callable[[Picture], Any]:
     if not callable(function):
         there = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
         raise DataError(f"{option}: expected a function {wanted} in {file}, found {shown(there)}")
-    return function
 
+    def judge(image: Picture) -> Any:
+        with _foreign(f"{option}: for an image {image.shape} {image.dtype} it"):
+            return function(image.copy())
 
-def _called(option: str, function: Callable[[Picture], Any], image: Picture) -> Any:
-    """Call a judge with a copy of an image: it may write into it, and raise anything."""
-    with _foreign(f"{option}: for an image {image.shape} {image.dtype} it"):
-        return function(image.copy())
+    return judge
 
 
 # --- verdicts ---------------------------------------------------------------------------------------------------------
@@ -150,19 +154,10 @@ OVERLAP = 0.5  # least IoU of a hit, as in PASCAL VOC
 
 IntArray = npt.NDArray[np.int64]
 
-FEWEST = {"objects": 100, "images": 10}
-"""Least numbers: a share of fewer objects has a wide interval, and a bootstrap over fewer images says little."""
-
 TOO_FEW = "rows of fewer than 100 objects or 10 images are too few to tell methods apart; add frames"
+"""A share of fewer objects has a wide interval, and a bootstrap over fewer images says little."""
 
 _DRAWS = 1000
-
-
-class Objects(NamedTuple):
-    """Objects that the detections in an image are compared with."""
-
-    boxes: FloatArray  # (n, 4) x0 y0 x1 y1 in pixels; pixel k reaches from k to k + 1
-    counts: BoolArray  # (n,); a detection of an object that does not count is neither a hit nor a miss
 
 
 class Matches(NamedTuple):
@@ -182,17 +177,20 @@ def ious(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(both / np.maximum(a_px[:, None] + b_px - both, 1e-9))
 
 
-def match(detections: Detections, objects: Objects) -> Matches:
-    """Match detections, the surest first, each with the free object that it overlaps most."""
-    true, uncounted = objects.boxes[objects.counts], objects.boxes[~objects.counts]
-    hits, free = np.zeros(len(detections.boxes), bool), np.ones(len(true), bool)
-    overlaps = ious(detections.boxes, true)
-    for k in np.argsort(-detections.scores, kind="stable") if len(true) else ():
+def match(detections: Detections, true: Detections) -> Matches:
+    """Match detections, the surest first, each with the free object that it overlaps most.
+
+    Sure detections in the true image are the objects; detections of unsure ones are neither hits nor misses.
+    """
+    is_object = true.scores >= CONFIDENCE
+    overlaps, uncounted = (ious(detections.boxes, true.boxes[chosen]) for chosen in (is_object, ~is_object))
+    hits, free = np.zeros(len(detections.boxes), bool), np.ones(is_object.sum(), bool)
+    for k in np.argsort(-detections.scores, kind="stable") if len(free) else ():
         best = np.where(free, overlaps[k], 0).argmax()
         hits[k] = free[best] and overlaps[k, best] >= OVERLAP
         free[best] &= not hits[k]
-    chosen = hits | (ious(detections.boxes, uncounted).max(axis=1, initial=0) < OVERLAP)
-    return Matches(detections.scores[chosen], hits[chosen], len(true))
+    chosen = hits | (uncounted.max(axis=1, initial=0) < OVERLAP)
+    return Matches(detections.scores[chosen], hits[chosen], len(free))
 
 
 def precision_and_recall(matches: Sequence[Matches], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -213,65 +211,48 @@ def precision_and_recall(matches: Sequence[Matches], weights: FloatArray) -> tup
     return average, (weights_of * (hits & (scores >= CONFIDENCE))).sum(axis=1) / num_true
 
 
-class Reference(NamedTuple):
-    """A true image that a view is compared with."""
-
-    valid: BoolArray  # (h, w) pixels that count
-    objects: Objects | None = None
-    masks: BoolArray | None = None
-
-
 @dataclass
 class Panel:
     """Networks, and their verdicts on all views so far, against their output for the true images.
 
-    Sure detections in the true images are the objects. Frames without a truth are not judged.
+    Frames without a truth are not judged.
     """
 
     detector: Detector | None = None
     segmenter: Segmenter | None = None
     matches: dict[str, list[Matches]] = field(default_factory=dict)  # by method
     pixels: dict[str, list[IntArray]] = field(default_factory=dict)  # (masks, 2) intersection and union, by method
-    _frame: str = ""
-    _references: list[Reference] = field(default_factory=list)  # of that frame, by camera
+    _frame: ScoredFrame | None = None  # the last one
+    _true: list[tuple[Detections | None, BoolArray | None]] = field(default_factory=list)  # of that frame, by camera
 
-    def look(self, name: str, frame: ScoredFrame, method: str, rig: Rig, views: Sequence[RenderedView]) -> None:
+    def look(self, frame: ScoredFrame, method: str, rig: Rig, views: Sequence[RenderedView]) -> None:
         """Judge a method's views for a rig; before the first ones, the true images."""
         if frame.truth is None:
             return
-        if name != self._frame:
-            self._frame, self._references, truth = name, [], frame.truth(rig)
-            for image, valid in zip(map(to_bytes, truth.images), truth.valid, strict=True):
-                objects = None
-                if self.detector is not None:
-                    found = valid_detections(self.detector(image), valid)
-                    objects = Objects(found.boxes, found.scores >= CONFIDENCE)
-                masks = None if self.segmenter is None else self.segmenter(image)
-                self._references.append(Reference(valid, objects, masks))
-        for view, reference in zip(views, self._references, strict=True):
-            image = to_bytes(view.image)
-            if self.detector is not None and reference.objects is not None:
-                found = valid_detections(self.detector(image), reference.valid)
-                self.matches.setdefault(method, []).append(match(found, reference.objects))
-            if self.segmenter is not None and reference.masks is not None:
-                masks = self.segmenter(image)
-                if len(masks) != len(reference.masks):
-                    expected = f"as many masks as in the true image, {len(reference.masks)}"
-                    raise DataError(f"--segmenter: expected {expected}, got {len(masks)} in a view by {method}")
-                ours, true = masks & reference.valid, reference.masks & reference.valid
-                counts = np.stack([(ours & true).sum(axis=(1, 2)), (ours | true).sum(axis=(1, 2))], axis=1)
-                self.pixels.setdefault(method, []).append(counts)
+        truth = frame.truth(rig)
+        if frame is not self._frame:
+            self._frame, self._true = frame, list(map(self._seen, truth.images, truth.valid))
+        for view, valid, (objects, masks) in zip(views, truth.valid, self._true, strict=True):
+            found, shown_masks = self._seen(view.image, valid)
+            if found is not None and objects is not None:
+                self.matches.setdefault(method, []).append(match(found, objects))
+            if shown_masks is not None and masks is not None:
+                if len(shown_masks) != len(masks):
+                    expected = f"as many masks as in the true image, {len(masks)}"
+                    raise DataError(f"--segmenter: expected {expected}, got {len(shown_masks)} in a view by {method}")
+                counts = [(shown_masks & masks).sum(axis=(1, 2)), (shown_masks | masks).sum(axis=(1, 2))]
+                self.pixels.setdefault(method, []).append(np.stack(counts, axis=1))
+
+    def _seen(self, image: Image, valid: BoolArray) -> tuple[Detections | None, BoolArray | None]:
+        """Detections and masks of an image on valid pixels (h, w)."""
+        picture = to_bytes(image)
+        found = None if self.detector is None else self.detector(picture).valid(valid)
+        return found, None if self.segmenter is None else self.segmenter(picture) & valid
 
     def rows(self, methods: Sequence[str]) -> dict[str, dict[str, float]]:
         """``figures`` of each method."""
         rows = {name: figures(self.matches.get(name, ()), self.pixels.get(name, ())) for name in methods}
         return {name: row for name, row in rows.items() if row}
-
-
-def valid_detections(detections: Detections, valid: BoolArray) -> Detections:
-    """The detections whose centres are on valid pixels (h, w)."""
-    x, y = ((detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2).astype(int).T
-    return detections.subset(valid[y.clip(max=valid.shape[0] - 1), x.clip(max=valid.shape[1] - 1)])
 
 
 def figures(matches: Sequence[Matches], pixels: Sequence[IntArray] = ()) -> dict[str, float]:
@@ -300,8 +281,3 @@ def draws_of(count: int) -> FloatArray:
     """(1 + draws, count) weights of ``count`` things: 1 each, and numbers of draws with replacement."""
     drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_DRAWS)
     return np.concatenate([np.ones((1, count)), drawn])
-
-
-def too_few(rows: Iterable[Mapping[str, float]]) -> bool:
-    """Whether some row has fewer objects or images than ``FEWEST``."""
-    return any(row.get(unit, fewest) < fewest for row in rows for unit, fewest in FEWEST.items())

@@ -12,6 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,8 +22,8 @@ from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import REAL_TARGET, add_options, count, output_file, seed, size
-from arbiview_aug.cli.parsers import SIZE
+from arbiview_aug.cli.arguments import REAL_TARGET, count, output_file, seed, size
+from arbiview_aug.cli.parsers import SIZE, add_options
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.synthetic import demo_target_rig
 from arbiview_aug.environment import one_thread
@@ -159,7 +160,7 @@ def parser() -> argparse.ArgumentParser:
         "--data FOLDER --workers 0 2",
     )
     add_options(made, "--data", without="synthetic streets, written as JPEGs")
-    add = made.add_argument
+    add = partial(add_options, made)
     add("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
     add_options(made, "--downscale", default=2)
     add_options(made, "--target")

@@ -22,7 +22,8 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Quality, Reduce
-from arbiview_aug.cli.arguments import add_options, count, named_steps, size, writable_folder
+from arbiview_aug.cli.arguments import count, named_steps, size, writable_folder
+from arbiview_aug.cli.parsers import add_options
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
 from arbiview_aug.datasets.registry import data_name

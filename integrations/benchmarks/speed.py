@@ -41,8 +41,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Reduce
-from arbiview_aug.cli.arguments import add_options, count, output_file, size
-from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
+from arbiview_aug.cli.arguments import count, output_file, size
+from arbiview_aug.cli.parsers import FULL_SIZE, SIZE, add_options
 from arbiview_aug.datasets import FrameFolder, Neighbours, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import DataError, WarnOnce
@@ -386,7 +386,7 @@ def parser() -> argparse.ArgumentParser:
         "--device cuda",
     )
     add_options(made, "--data", without="nuscenes-one below ARBIVIEW_DATA where that is, else a synthetic street")
-    add = made.add_argument
+    add = partial(add_options, made)
     add("--size", type=size, nargs="+", default=[SIZE, FULL_SIZE], metavar="HxW", help="of views (default: both)")
     add("--repeats", type=count, default=5, metavar="N", help="rounds of timing")
     add("--only", metavar="TEXT", default="", help="calls whose names contain it")

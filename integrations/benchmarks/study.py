@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from arbiview_aug.cli.arguments import command_parser
+from arbiview_aug.cli.parsers import command_parser
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -41,7 +41,7 @@ _LEAST_ROUNDS = 3  # a median of fewer is a single time
 
 def study_parser(name: str, description: str, example: str) -> argparse.ArgumentParser:
     """Create the parser of ``python -m integrations.benchmarks.NAME``, without its options."""
-    return command_parser("", description, example, program=f"python -m integrations.benchmarks.{name}")
+    return command_parser(f"python -m integrations.benchmarks.{name}", description, example)
 
 
 def run_study(

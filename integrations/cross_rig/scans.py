@@ -20,7 +20,8 @@ import numpy as np
 
 from arbiview_aug import Lidar, Rig, retarget_points
 from arbiview_aug.atomic_io import write_whole
-from arbiview_aug.cli.arguments import command_parser, count
+from arbiview_aug.cli.arguments import count
+from arbiview_aug.cli.parsers import command_parser
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.scene.boxes import points_by_box
@@ -144,7 +145,7 @@ def table(done: dict[str, dict[Kind, list[dict[str, Any]]]]) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Train and test what is missing, and print the table."""
-    parser = command_parser("", __doc__, "--changes fewer --seeds 0", program="python -m integrations.cross_rig.scans")
+    parser = command_parser("python -m integrations.cross_rig.scans", __doc__, "--changes fewer --seeds 0")
     parser.add_argument("--changes", nargs="+", choices=CHANGES, default=tuple(CHANGES), help="of the scanner")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, metavar="SEED", help="trainings")
     for name, number in (("train-frames", 150), ("val-frames", 50), ("test-frames", 150), ("steps", 300)):

@@ -18,7 +18,6 @@ from arbiview_aug.evaluate.judges import (
     Detections,
     Detector,
     Matches,
-    Objects,
     Panel,
     figures,
     load_detector,
@@ -141,7 +140,7 @@ def detector(by_colour: Mapping[int, Sequence[Sequence[float]]], score: float = 
 
 def looked(panel: Panel, shown: ScoredFrame) -> dict[str, dict[str, float]]:
     """Rows of a panel that saw one frame by one method."""
-    panel.look("frame", shown, "own", RIG, [RenderedView(plain(VIEW), ALL)])
+    panel.look(shown, "own", RIG, [RenderedView(plain(VIEW), ALL)])
     return panel.rows(["own"])
 
 
@@ -206,7 +205,7 @@ def detections(boxes: np.ndarray, *scores: float) -> Detections:
 
 # --- average precision and recall -------------------------------------------------------------------------------------
 def scores(found: Detections, true: np.ndarray, others: np.ndarray = NONE) -> tuple[float, float]:
-    objects = Objects(np.concatenate([true, others]), np.arange(len(true) + len(others)) < len(true))
+    objects = detections(np.concatenate([true, others]), *[0.9] * len(true), *[0.4] * len(others))
     ap, recall = precision_and_recall([match(found, objects)], np.ones((1, 1)))
     return float(ap[0]), float(recall[0])
 
@@ -226,7 +225,7 @@ def test_average_precision_and_recall() -> None:
 
 def test_the_surest_takes_the_best_free_box() -> None:
     both = np.array([[0.0, 0, 10, 10], [1, 0, 11, 10]])
-    found = match(detections(both[[0, 0, 0]], 0.5, 0.9, 0.4), Objects(both, np.ones(2, bool)))
+    found = match(detections(both[[0, 0, 0]], 0.5, 0.9, 0.4), detections(both, 0.9, 0.9))
     assert found.hits.tolist() == [True, True, False] and found.num_true == 2
 
 

@@ -146,6 +146,7 @@ def test_scores_on_common_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[s
         means["fast, lidar"]["gain_psnr_db"] - means["fast, infinity"]["gain_psnr_db"]
     )
     assert "class 7" in means["fast, lidar"] and "Frames of one drive are alike" in printed
+    assert "cannot be reached" not in printed, "there is no target to choose"
 
     sample, squares = FrameFolder(data)[0], []
     views = {}
@@ -193,7 +194,8 @@ def test_a_copy_of_the_camera_gives_back_its_photograph(tmp_path: Path) -> None:
 def test_neighbours_lose_the_camera_too() -> None:
     drive = SyntheticDrive(THREE, num_frames=1, supersampling=1, neighbours=Neighbours(count=1, step_m=1.2))
     ((name, frame),) = held_out_frames(drive, [0], ["front"])
-    assert name.endswith(": front") and frame.sample["rig"].names == ["left", "right"]
+    assert name == drive[0]["token"] and frame.target is not None and frame.target.names == ["front"]
+    assert frame.sample["rig"].names == ["left", "right"]
     assert len(frame.sample["K"]) == 2 and frame.sample["neighbours"]
     for neighbour in frame.sample["neighbours"]:
         assert len(neighbour["images"]) == 2
