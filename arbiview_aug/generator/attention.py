@@ -31,8 +31,8 @@ each Attention^(l) a softmax over the 3 x 3 tokens around p_j^(l), with PE(Δp) 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -44,6 +44,8 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import between
 from arbiview_aug.render.requirements import SAME_CENTER_M
 
+_Nested = TypeVar("_Nested")
+
 FACING_M = 10.0  # of the plane that faces the camera: at a baseline of 1 m a 3-token window spans 7 to 17 m
 LEVELS = ("infinity", "road", "facing")  # the depth levels; pairs whose centres coincide have the first alone
 
@@ -54,9 +56,6 @@ class Correspondence(NamedTuple):
     neighbour: torch.Tensor  # (B, Q, J) int64, the key view of each of J slots; 0 in unused slots
     centre: torch.Tensor  # (B, Q, J, L, h, w, 2) float32, p_j^(l) as (x, y) in tokens; 0 where not valid
     valid: torch.Tensor  # (B, Q, J, L, h, w) bool, M_j^(l)
-
-    def to(self, device: torch.device | str) -> Correspondence:
-        return Correspondence(*(value.to(device, non_blocking=True) for value in self))
 
     def without(self, views: int, dropped: torch.Tensor) -> Correspondence:
         """Mask the first ``views`` key views in the frames ``dropped`` (B,) bool."""
@@ -119,44 +118,50 @@ def correspondences(
     the finest first. All cameras and the road lie in one ego frame.
     """
     small = [[camera.resize(size) for size in sizes] for camera in keys]
-    by_query: list[list[tuple[int, list[tuple[FloatArray, BoolArray]]]]] = []
+    nothing = [_slot(0, np.zeros((1, *size, 2)), np.zeros((1, *size), bool)) for size in sizes]
+    reads = []
     for query, self_index in zip(queries, own_index, strict=True):
         planes = plane_vectors(query, ground_z_m)
         rays = [camera.unproject_cam(camera.pixel_grid()) for camera in map(query.resize, sizes)]
-        by_query.append([])  # views j that overlap the query, with ``correspond`` for each token grid
+        slots = []
         for j, cameras in enumerate(small):
             same_centre = float(np.abs(query.center_m - cameras[0].center_m).max()) < SAME_CENTER_M
             used = planes[:1] if same_centre else planes
             if j != self_index and (first := correspond(query, rays[0], cameras[0], used))[1].any():
                 rest = [correspond(query, ray, key, used) for ray, key in zip(rays[1:], cameras[1:], strict=True)]
-                by_query[-1].append((j, [first, *rest]))
-    slots = max(1, *(len(overlaps) for overlaps in by_query))
-    levels = max((len(grids[0][0]) for overlaps in by_query for _, grids in overlaps), default=1)
-    shapes = [(1, len(queries), slots, levels, h, w) for h, w in sizes]
-    neighbour = torch.zeros(shapes[0][:3], dtype=torch.int64)
-    reads = [
-        Correspondence(neighbour, torch.zeros((*shape, 2)), torch.zeros(shape, dtype=torch.bool)) for shape in shapes
-    ]
-    for q, overlaps in enumerate(by_query):
-        for slot, (j, grids) in enumerate(overlaps):
-            neighbour[0, q, slot] = j
-            for read, (centre, valid) in zip(reads, grids, strict=True):
-                read.centre[0, q, slot, : len(centre)] = torch.from_numpy(centre.astype(np.float32))
-                read.valid[0, q, slot, : len(valid)] = torch.from_numpy(valid)
-    return reads
+                slots.append([_slot(j, *grid) for grid in (first, *rest)])
+        reads.append(joined(slots or [nothing], axis=2))
+    return joined(reads, axis=1)
 
 
-def stacked(frames: Sequence[Correspondence]) -> Correspondence:
-    """One batch of frames with equal numbers of query views; slots and levels are padded with invalid ones."""
-    slots, levels = (max(frame.valid.shape[axis] for frame in frames) for axis in (2, 3))
-    padded = []
-    for neighbour, centre, valid in frames:
-        more = 0, slots - valid.shape[2]
-        grid = 0, 0, 0, 0, 0, levels - valid.shape[3], *more
-        padded.append(
-            (functional.pad(neighbour, more), functional.pad(centre, (0, 0, *grid)), functional.pad(valid, grid))
-        )
-    return Correspondence(*(torch.cat(values) for values in zip(*padded, strict=True)))
+def _slot(j: int, centre: FloatArray, valid: BoolArray) -> Correspondence:
+    """The correspondence of one query with the key view j."""
+    tensors = torch.tensor(j), torch.from_numpy(centre.astype(np.float32)), torch.from_numpy(valid)
+    return Correspondence(*(tensor[None, None, None] for tensor in tensors))
+
+
+def mapped(function: Callable[..., torch.Tensor], *values: _Nested) -> _Nested:
+    """Apply a function to tensors, or to those at each place of nested tuples and lists of one structure."""
+    nested: Any = values
+    first: Any = values[0]
+    if isinstance(first, torch.Tensor):
+        return function(*nested)  # type: ignore[return-value]
+    parts = [mapped(function, *parts) for parts in zip(*nested, strict=True)]
+    return first._make(parts) if hasattr(first, "_make") else type(first)(parts)
+
+
+def joined(parts: Sequence[_Nested], axis: int = 0) -> _Nested:
+    """Join (nested) tensors along an axis; the others are padded with zeros to the largest."""
+
+    def join(*tensors: torch.Tensor) -> torch.Tensor:
+        most = [max(sizes) for sizes in zip(*(tensor.shape for tensor in tensors), strict=True)]
+        padded = []
+        for tensor in tensors:
+            missing = [n - size if k != axis else 0 for k, (n, size) in enumerate(zip(most, tensor.shape, strict=True))]
+            padded.append(functional.pad(tensor, [n for more in reversed(missing) for n in (0, more)]))
+        return torch.cat(padded, axis)
+
+    return mapped(join, *parts)
 
 
 # --- windows ----------------------------------------------------------------------------------------------------------
@@ -228,49 +233,35 @@ HEAD_WIDTH = 32
 _INFINITY_LOGIT = 2.0  # initial scalar of level infinity, 0 for the others: w = .79, .11, .11
 
 
-class PositionalEncoding(nn.Module):
+def positional_encoding(delta: torch.Tensor) -> torch.Tensor:
     """PE(p_i, p_j) = concat(sin(W1 Δp), cos(W2 Δp)), Δp = p_j − H p_i in tokens (Sec. Geometric Design of PE).
 
     W1 = W2: frequencies log-spaced from π/16 to π a token along x and along y; π is the highest that a token grid can
-    resolve. Equal maps let a shift of Δp rotate each (sin, cos) pair, see ``rotate_queries``.
+    resolve. Equal maps let a shift of Δp rotate each (sin, cos) pair, see ``rotated``. (..., 32) of Δp (..., 2), in
+    float32: a matrix product would be bfloat16 or TF32 on a GPU.
     """
-
-    def forward(self, delta: torch.Tensor) -> torch.Tensor:
-        """(..., 32) of Δp (..., 2), in float32: a matrix product would be bfloat16 or TF32 on a GPU."""
-        frequency = math.pi * 2.0 ** torch.linspace(-4, 0, HEAD_WIDTH // 4, device=delta.device)
-        W = torch.block_diag(frequency[:, None], frequency[:, None])  # half of the rows for x, half for y
-        angle = (delta.float()[..., None, :] * W).sum(-1)
-        return torch.cat([torch.sin(angle), torch.cos(angle)], -1)
-
-    def rotate_queries(self, queries: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
-        """Queries (..., heads, width) rotated by ``offset`` (..., 2) tokens: rotated(q, b)·PE(a) = q·PE(a − b).
-
-        sin(a − b) = sin a cos b − cos a sin b and cos(a − b) = cos a cos b + sin a sin b: one sine and cosine a token
-        instead of one for each of its taps.
-        """
-        sin, cos = self(offset).to(queries.dtype)[..., None, :].chunk(2, -1)
-        q_sin, q_cos = queries.chunk(2, -1)
-        return torch.cat([q_sin * cos + q_cos * sin, q_cos * cos - q_sin * sin], -1)
+    frequency = math.pi * 2.0 ** torch.linspace(-4, 0, HEAD_WIDTH // 4, device=delta.device)
+    W = torch.block_diag(frequency[:, None], frequency[:, None])  # half of the rows for x, half for y
+    angle = (delta.float()[..., None, :] * W).sum(-1)
+    return torch.cat([torch.sin(angle), torch.cos(angle)], -1)
 
 
-class GEGLU(nn.Module):
-    """Feed-forward x → (a ⊙ GELU(b)) W, [a, b] = x W_in (Shazeer 2020), four times as wide inside."""
+def rotated(queries: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+    """Queries (..., heads, width) rotated by ``offset`` (..., 2) tokens: rotated(q, b)·PE(a) = q·PE(a − b).
 
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.inner = nn.Linear(width, 8 * width)
-        self.outer = nn.Linear(4 * width, width)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        value, gate = self.inner(x).chunk(2, -1)
-        return self.outer(value * functional.gelu(gate))
+    sin(a − b) = sin a cos b − cos a sin b and cos(a − b) = cos a cos b + sin a sin b: one sine and cosine a token
+    instead of one for each of its taps.
+    """
+    sin, cos = positional_encoding(offset).to(queries.dtype)[..., None, :].chunk(2, -1)
+    q_sin, q_cos = queries.chunk(2, -1)
+    return torch.cat([q_sin * cos + q_cos * sin, q_cos * cos - q_sin * sin], -1)
 
 
 class CrossViewAttention(nn.Module):
     """One block: cross-view attention, then a feed-forward, both residual with zero-initialised outputs.
 
-    About 16 width² parameters; the width is a multiple of 32, that of a head. Keys and values of each view are
-    projected once (``keys_values``) and then gathered.
+    The feed-forward is GEGLU (Shazeer 2020). About 16 width² parameters; the width is a multiple of 32, that of a head.
+    Keys and values of each view are projected once (``keys_values``) and then gathered.
     """
 
     def __init__(self, width: int, levels: int) -> None:
@@ -279,11 +270,11 @@ class CrossViewAttention(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.to_q, self.to_k, self.to_v = (nn.Linear(width, width, bias=False) for _ in range(3))
         self.to_out = nn.Linear(width, width)
-        self.positions = PositionalEncoding()
         self.level_logits = nn.Parameter(torch.tensor([_INFINITY_LOGIT] + [0.0] * (levels - 1)))
         self.feed_norm = nn.LayerNorm(width)
-        self.feed = GEGLU(width)
-        for last in (self.to_out, self.feed.outer):
+        inner, outer = nn.Linear(width, 8 * width), nn.Linear(4 * width, width)
+        self.feed = nn.ModuleDict({"inner": inner, "outer": outer})
+        for last in (self.to_out, outer):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
@@ -303,8 +294,8 @@ class CrossViewAttention(nn.Module):
         """
         q = self.to_q(self.norm(tokens)).reshape(-1, self.heads, HEAD_WIDTH).index_select(0, at.token)
         logits = (q[:, None] * self._gather(keys, at.tap)).sum(-1).transpose(1, 2)  # q·k, [E, heads, 9]
-        encoding = self.positions(tap_offsets(q.device)).to(q.dtype)
-        logits = logits + self.positions.rotate_queries(q, at.fraction) @ encoding.T  # q·PE(Δp)
+        encoding = positional_encoding(tap_offsets(q.device)).to(q.dtype)
+        logits = logits + rotated(q, at.fraction) @ encoding.T  # q·PE(Δp)
         logits = (logits / math.sqrt(HEAD_WIDTH)).masked_fill(~at.inside[:, None], MASKED)
         share = torch.softmax(logits.float(), -1) * self._weights(logits[..., TAPS // 2], at)[..., None]
         read = self._gather(values, at.tap)  # [E, 9, heads, 32]
@@ -314,7 +305,8 @@ class CrossViewAttention(nn.Module):
         attended = values.new_zeros(B * Q * T, values.shape[-1]).index_add(0, at.token, weighted).view(B, Q, T, -1)
         gate = at.read[..., None].to(tokens.dtype)
         tokens = tokens + gate * self.to_out(attended)
-        tokens = tokens + gate * self.feed(self.feed_norm(tokens))
+        value, by = self.feed["inner"](self.feed_norm(tokens)).chunk(2, -1)
+        tokens = tokens + gate * self.feed["outer"](value * functional.gelu(by))
         return tokens, torch.softmax(logits.float(), -1).mean(1) if with_rows else None
 
     def _weights(self, nearest: torch.Tensor, at: TokenWindow) -> torch.Tensor:

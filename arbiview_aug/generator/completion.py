@@ -13,15 +13,14 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch.nn import functional
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator.attention import TokenWindow
-from arbiview_aug.generator.conditioning import FrameGeometry, ViewInputs, batched, frame_geometry, nearest_sources
+from arbiview_aug.generator.attention import TokenWindow, joined, mapped
+from arbiview_aug.generator.conditioning import Branches, ViewInputs, frame_geometry, nearest_sources
 from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, noise_schedule
 from arbiview_aug.generator.generator import Generator
@@ -44,61 +43,34 @@ from arbiview_aug.sample.frame import Frame
 Predict = Callable[[torch.Tensor, int], torch.Tensor]  # maps (x_t, t) to the prediction, or to x0 at ``REGRESSION``
 
 
-class Conditions(NamedTuple):
-    """Inputs of the generator for N targets and S sources of B frames, at its image size."""
-
-    prefilled: torch.Tensor  # (B, N, 3, H, W) in [0, 1], FAVS at the targets with holes inpainted
-    known: torch.Tensor  # (B, N, H, W) bool, or shares in [0, 1]
-    confidence: torch.Tensor  # (B, N, H, W) in [0, 1]
-    sources: torch.Tensor  # (B, S, 3, H, W) in [0, 1], read where they are seen
-    seen: torch.Tensor  # (B, S, H, W) valid pixels of the sources, bool, or 0 and 1
-
-    def encoded(
-        self, config: GeneratorConfig, autoencoder: Autoencoder, geometry: FrameGeometry
-    ) -> tuple[ViewInputs, ViewInputs]:
-        """The denoiser's conditions of the targets and of the sources."""
-        latent = autoencoder.encode(shown_condition(config, self.prefilled, self.known)).float()
-        sources = autoencoder.encode(self.sources * self.seen[:, :, None]).float()
-        targets = geometry.target_views(latent, self.known, self.confidence)
-        return targets, geometry.source_views(sources, self.seen, self.seen)
-
-
-def with_sampling(config: GeneratorConfig, steps: int | None, guidance: float | None) -> GeneratorConfig:
-    """The config with steps and guidance where given; GeneratorError where its generator cannot sample so."""
-    default = config.guidance
-    steps, guidance = config.steps if steps is None else steps, default if guidance is None else guidance
-    config = replace(config, steps=steps, guidance=guidance)
-    if config.steps == 1 and not config.one_step:
-        why = f"the one-step regression of generator {config.name!r} was not trained (loss.regression=0)"
-        raise GeneratorError(f"steps: expected at least 2, got 1: {why}")
-    if config.steps == 1 and guidance not in (1, default):
-        raise GeneratorError(f"guidance: expected none with one step, which it cannot change, got {guidance}")
-    return config
+def encoded(
+    config: GeneratorConfig, autoencoder: Autoencoder, targets: Branches, sources: Branches
+) -> tuple[ViewInputs, ViewInputs]:
+    """The denoiser's conditions of the targets and of the sources."""
+    shown, seen = shown_condition(config, targets), sources.images * sources.known[:, :, None]
+    return targets.inputs(autoencoder.encode(shown).float()), sources.inputs(autoencoder.encode(seen).float())
 
 
 def denoised(
-    generator: Generator,
-    config: GeneratorConfig,
-    geometry: FrameGeometry,
-    conditions: Conditions,
-    noise: torch.Tensor,
+    generator: Generator, config: GeneratorConfig, targets: Branches, sources: Branches, noise: torch.Tensor
 ) -> torch.Tensor:
     """Sample the N targets of B frames from noise (B, N, C, h, w): (B, N, 3, H, W) float32, not yet cut to [0, 1].
 
     ``config`` may differ from the generator's in ``steps`` and ``guidance``.
     """
     denoiser, autoencoder = generator.denoiser, generator.autoencoder
-    views, source_views = conditions.encoded(config, autoencoder, geometry)
-    sources = denoiser.read_sources(source_views, geometry.source_windows())
-    windows = geometry.target_windows()
+    views, source_views = encoded(config, autoencoder, targets, sources)
+    keys = denoiser.read_sources(source_views, sources.geometry.windows())
+    count = sources.images.shape[1]
+    windows = targets.geometry.windows(count)
     all_frames = torch.ones(len(noise), dtype=torch.bool, device=noise.device)
     is_guided = config.guidance != 1 and config.steps > 1
-    unconditional = (views.dropped(all_frames), geometry.target_windows(all_frames)) if is_guided else None
+    unconditional = (views.dropped(all_frames), targets.geometry.windows(count, all_frames)) if is_guided else None
 
     def predict(x: torch.Tensor, t: int) -> torch.Tensor:
         def run(views: ViewInputs, windows: Sequence[TokenWindow]) -> torch.Tensor:
             generator.calls += 1
-            return denoiser(x, torch.full((len(x),), t, device=x.device), views, windows, sources).float()
+            return denoiser(x, torch.full((len(x),), t, device=x.device), views, windows, keys).float()
 
         conditional = run(views, windows)
         if unconditional is None or t == REGRESSION:
@@ -107,13 +79,13 @@ def denoised(
         return without + config.guidance * (conditional - without)
 
     starts_inpainted = not (config.prefilled or config.residual or config.steps == 1)
-    start = autoencoder.encode(conditions.prefilled) if starts_inpainted else views.latent
+    start = autoencoder.encode(targets.images) if starts_inpainted else views.latent
     return autoencoder.decode(sample(predict, start, noise, config)).float()
 
 
-def shown_condition(config: GeneratorConfig, prefilled: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """The condition (..., 3, H, W) as in training: inpainted, or with grey holes if the config is not ``prefilled``."""
-    return prefilled if config.prefilled else torch.where(known[..., None, :, :] >= 0.5, prefilled, 0.5)
+def shown_condition(config: GeneratorConfig, targets: Branches) -> torch.Tensor:
+    """The condition (B, N, 3, H, W) as in training: with filled holes, or grey ones if not ``prefilled``."""
+    return targets.images if config.prefilled else torch.where(targets.known[:, :, None] >= 0.5, targets.images, 0.5)
 
 
 def unit(image: torch.Tensor) -> torch.Tensor:
@@ -158,7 +130,7 @@ def sample(predict: Predict, prefilled: torch.Tensor, noise: torch.Tensor, confi
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: only a seam is left
 VIEWS_AT_ONCE = 24  # views that the denoiser sees in one call; a whole frame in any case
 
-_Inputs = tuple[Conditions, FrameGeometry, torch.Tensor]
+_Inputs = tuple[Branches, Branches, torch.Tensor]  # targets, sources, noise
 _HUB_ID = re.compile(r"\w[\w.-]*/[\w.-]+")
 
 
@@ -181,6 +153,7 @@ class Diffusion(Inpainter, torch.nn.Module):
     outcome = "made up by the generator"
     is_random = True
     needs_layers = True
+    needs_confidence = True
 
     def __init__(
         self,
@@ -199,8 +172,14 @@ class Diffusion(Inpainter, torch.nn.Module):
         if not isinstance(generator, Generator | str | Path):
             raise ValueError(f"generator: expected a Generator or its folder, got {type(generator).__name__}")
         self.generator = generator if isinstance(generator, Generator) else Generator.from_pretrained(generator)
-        self.steps, self.guidance = steps, guidance
-        with_sampling(self.generator.config, steps, guidance)
+        given = self.generator.config
+        steps, guidance = given.steps if steps is None else steps, given.guidance if guidance is None else guidance
+        self.config = replace(given, steps=steps, guidance=guidance)
+        if steps == 1 and not given.one_step:
+            why = f"the one-step regression of generator {given.name!r} was not trained (loss.regression=0)"
+            raise GeneratorError(f"steps: expected at least 2, got 1: {why}")
+        if steps == 1 and guidance not in (1, given.guidance):
+            raise GeneratorError(f"guidance: expected none with one step, which it cannot change, got {guidance}")
 
     def train(self, mode: bool = True) -> Diffusion:
         """Leave the generator in evaluation mode: a transform in a model that trains still fills holes."""
@@ -208,77 +187,62 @@ class Diffusion(Inpainter, torch.nn.Module):
         self.generator.eval()
         return self
 
-    @property
-    def needs_confidence(self) -> bool:
-        return True
-
+    @torch.no_grad()
     def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         """Fill rendered frames; ``frames`` hold their source images.
 
-        All are filled as by default (``Continue``); views that are almost complete stay so. A frame's others are
-        denoised together, so that they agree. Frames with as many views and sources share the denoiser's calls.
+        All views are filled as by default (``Continue``); those that are almost complete stay so. The others of a frame
+        are denoised together, so that they agree. Frames with as many views and sources share the denoiser's calls.
         GeneratorError for generated pixels that are not finite.
         """
-        images, holes = self._completed(rendered, frames)
-        return [put(*frame) for frame in zip(rendered, images, holes, strict=True)]
-
-    @torch.no_grad()
-    def _completed(
-        self, rendered: Sequence[Views], frames: Sequence[Frame]
-    ) -> tuple[list[list[torch.Tensor]], list[list[torch.Tensor]]]:
-        """Images of each frame with completed holes, and the holes."""
         check_device(self.generator)
-        names, images, holes = frame_names(frames), [list[torch.Tensor]() for _ in frames], []
+        names, device = frame_names(frames), self.generator.device
+        images, holes = [list[torch.Tensor]() for _ in frames], [list[torch.Tensor]() for _ in frames]
         alike: dict[tuple[int, int], list[tuple[int, list[int], _Inputs]]] = {}
-        for n, (frame, source) in enumerate(zip(rendered, frames, strict=True)):
-            known, frame_holes = holes_of(frame, self.min_confidence)
-            holes.append(frame_holes)
-            copied = [image.clone() for image in frame.images]
-            images[n] = Continue().fill([replace(frame, images=copied, coverage=known)], [source])[0].images
-            left = [m for m, hole in enumerate(frame_holes) if float(hole.float().mean()) > 1 - ALMOST_COMPLETE]
+        for n, (views, frame, name) in enumerate(zip(rendered, frames, names, strict=True)):
+            known, holes[n] = holes_of(views, self.min_confidence)
+            copied = [image.clone() for image in views.images]
+            images[n] = list(Continue().fill([replace(views, images=copied, coverage=known)], [frame])[0].images)
+            left = [m for m, hole in enumerate(holes[n]) if float(hole.float().mean()) > 1 - ALMOST_COMPLETE]
             if left:
-                inputs = self._inputs(frame, source, images[n], known, left, names[n])
-                alike.setdefault((len(left), inputs[0].sources.shape[1]), []).append((n, left, inputs))
-        config, device = with_sampling(self.generator.config, self.steps, self.guidance), self.generator.device
+                inputs = self._inputs(views, frame, images[n], known, left, name)
+                alike.setdefault((len(left), inputs[1].images.shape[1]), []).append((n, left, inputs))
         for (count, _), group in alike.items():
             size = max(1, VIEWS_AT_ONCE // count)
             for together in (group[start : start + size] for start in range(0, len(group), size)):
-                conditions, geometries, noise = zip(*(inputs for _, _, inputs in together), strict=True)
-                batch = Conditions(*(torch.cat(part).to(device) for part in zip(*conditions, strict=True)))
-                geometry = batched(geometries).to(device)
-                done = denoised(self.generator, config, geometry, batch, torch.cat(noise).to(device)).cpu()
-                for (n, left, (before, *_)), generated in zip(together, done, strict=True):
-                    for m, image in zip(left, generated - before.prefilled[0], strict=True):
-                        if not bool(image.isfinite().all()):
+                batch = mapped(lambda tensor: tensor.to(device), joined([inputs for _, _, inputs in together]))
+                made = denoised(self.generator, self.config, *batch).cpu()
+                for (n, left, (targets, *_)), generated in zip(together, made, strict=True):
+                    for m, change in zip(left, generated - targets.images[0], strict=True):
+                        if not bool(change.isfinite().all()):
                             where = f"frame {names[n]:.40}, camera {rendered[n].rig[m].name!r}"
-                            expected = f"finite pixels from generator {self.generator.config.name!r}"
+                            expected = f"finite pixels from generator {self.config.name!r}"
                             fix = "pass finite images, no float16, less guidance"
                             raise GeneratorError(f"{where}: expected {expected}, got NaN or infinity: {fix}")
-                        images[n][m] = _changed(images[n][m], image)
-        return images, holes
+                        images[n][m] = _changed(images[n][m], change)
+        return [put(*frame) for frame in zip(rendered, images, holes, strict=True)]
 
     def _inputs(
         self, rendered: Views, source: Frame, filled: Tensors, known: Tensors, left: list[int], name: str
     ) -> _Inputs:
-        """Conditions, cameras and noise of a frame's views ``left``, ``filled`` as by default, on the CPU."""
-        config = self.generator.config
-        rig, size = rendered.rig.in_frame_of(source.rig), config.image_size
-        branches = sorted({k for m in left for k in nearest_sources(rig[m], source.rig.cameras)})
+        """Targets, sources and noise of a frame's views ``left``, ``filled`` as by default, on the CPU."""
+        config, size = self.config, self.config.image_size
+        rig = rendered.rig.in_frame_of(source.rig)
+        near = sorted({k for m in left for k in nearest_sources(rig[m], source.rig.cameras)})
+        cameras = [source.rig[k] for k in near]
+        geometry = frame_geometry([rig[m] for m in left], cameras, source.rig.ground_z_m, config)
         trust = rendered.coverage if rendered.confidence is None else rendered.confidence
-        views = []
-        for m in left:
-            maps = torch.stack([known[m].float(), trust[m].float() * known[m]])[None].cpu()
-            shares = functional.interpolate(maps, size, mode="bilinear", antialias=True)[0].clamp(0, 1)
-            views.append((unit(resized(filled[m].cpu(), size)), *shares))
-        images = [unit(resized(source.images[k], size)) for k in branches]
-        cameras = [source.rig[k] for k in branches]
-        seen = [valid_pixels(camera.resize(size)).float() for camera in cameras]
-        conditions = Conditions(*(torch.stack(list(part))[None] for part in (*zip(*views, strict=True), images, seen)))
+        maps = [torch.stack([known[m].float(), trust[m].float() * known[m]])[None].cpu() for m in left]
+        shares = torch.cat([functional.interpolate(part, size, mode="bilinear", antialias=True) for part in maps])
+        views = torch.stack([unit(resized(filled[m].cpu(), size)) for m in left])[None]
+        shown, confidence = shares.clamp(0, 1)[None].unbind(2)
+        targets = Branches(views, shown, confidence, geometry[0])
+        photographs = torch.stack([unit(resized(source.images[k], size)) for k in near])[None]
+        seen = torch.stack([valid_pixels(camera.resize(size)).float() for camera in cameras])[None]
         # Noise is drawn on the CPU, the same on every device, and by camera number: batches have no names.
         shape = config.autoencoder.latent_channels, *config.latent_size
-        noise = [torch.randn(shape, generator=seeded(self.seed, name, str(m))) for m in left]
-        geometry = frame_geometry([rig[m] for m in left], cameras, source.rig.ground_z_m, config)
-        return conditions, geometry, torch.stack(noise)[None]
+        noise = torch.stack([torch.randn(shape, generator=seeded(self.seed, name, str(m))) for m in left])[None]
+        return targets, Branches(photographs, seen, seen, geometry[1]), noise
 
 
 def _changed(view: torch.Tensor, change: torch.Tensor) -> torch.Tensor:

@@ -24,14 +24,7 @@ from torch.nn import functional
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import between
-from arbiview_aug.generator.attention import (
-    Correspondence,
-    TokenWindow,
-    correspondences,
-    stacked,
-    token_sizes,
-    window,
-)
+from arbiview_aug.generator.attention import Correspondence, TokenWindow, correspondences, token_sizes, window
 from arbiview_aug.generator.config import GeneratorConfig
 
 RAY_CHANNELS = 6
@@ -122,66 +115,52 @@ class PoseContext(nn.Module):
         return torch.cat([self.empty_prompt.expand(len(pose), -1, -1), token[:, None]], 1)
 
 
-# --- the cameras of a frame -------------------------------------------------------------------------------------------
-class FrameGeometry(NamedTuple):
-    """The N target and S source cameras of B frames. If both are read, sources are numbered before targets."""
+# --- the branches of a frame ------------------------------------------------------------------------------------------
+class BranchGeometry(NamedTuple):
+    """N cameras of B frames, the targets or the sources; where views read both, sources are numbered first."""
 
-    target_rays: torch.Tensor  # (B, N, 6, h, w), see ``plucker_rays``
-    target_pose: torch.Tensor  # (B, N, 16), see ``pose_vector``
-    source_rays: torch.Tensor  # (B, S, 6, h, w)
-    source_pose: torch.Tensor  # (B, S, 16)
-    target_reads: list[Correspondence]  # of the targets in sources and targets, one per token grid, the finest first
-    source_reads: list[Correspondence]  # of the sources in the other sources
+    rays: torch.Tensor  # (B, N, 6, h, w), see ``plucker_rays``
+    pose: torch.Tensor  # (B, N, 16), see ``pose_vector``
+    reads: list[Correspondence]  # one for each token grid, the finest first
 
-    def to(self, device: torch.device | str) -> FrameGeometry:
-        tensors = (value.to(device, non_blocking=True) for value in self[:4])
-        return FrameGeometry._make([*tensors, *([grid.to(device) for grid in reads] for reads in self[4:])])
+    def windows(self, sources: int = 0, dropped: torch.Tensor | None = None) -> list[TokenWindow]:
+        """Windows of targets in ``sources`` views and these, or of sources in each other.
 
-    def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> ViewInputs:
-        """The targets' conditions: latents (B, N, C, h, w), coverage and confidence (B, N, H, W) at any resolution."""
+        Frames ``dropped`` (B,) bool read no sources (classifier-free guidance).
+        """
+        reads = self.reads if dropped is None else [grid.without(sources, dropped) for grid in self.reads]
+        return [window(grid, sources + self.pose.shape[1]) for grid in reads]
+
+
+class Branches(NamedTuple):
+    """N views of B frames at the generator's image size: the targets, or the sources."""
+
+    images: torch.Tensor  # (B, N, 3, H, W) in [0, 1]: FAVS at the targets with holes filled; photographs of the sources
+    known: torch.Tensor  # (B, N, H, W) bool, or shares in [0, 1]; sources are read where they are known
+    confidence: torch.Tensor  # (B, N, H, W) in [0, 1]
+    geometry: BranchGeometry
+
+    def inputs(self, latent: torch.Tensor) -> ViewInputs:
+        """The denoiser's conditions, with the latents (B, N, C, h, w) of the images."""
         size = (latent.shape[-2], latent.shape[-1])
-        known, trust = pooled(mask, size)[:, :, None], pooled(confidence, size)[:, :, None]
-        return ViewInputs(latent, known, trust, self.target_rays, self.target_pose)
-
-    def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> ViewInputs:
-        """The sources' conditions, with the latents of their images."""
-        return self.target_views(latent, mask, confidence)._replace(rays=self.source_rays, pose=self.source_pose)
-
-    def target_windows(self, dropped: torch.Tensor | None = None) -> list[TokenWindow]:
-        """Windows of the targets, without sources in the frames ``dropped`` (B,) bool (classifier-free guidance)."""
-        sources, targets = self.source_pose.shape[1], self.target_pose.shape[1]
-        reads = self.target_reads if dropped is None else [c.without(sources, dropped) for c in self.target_reads]
-        return [window(c, sources + targets) for c in reads]
-
-    def source_windows(self) -> list[TokenWindow]:
-        return [window(c, self.source_pose.shape[1]) for c in self.source_reads]
+        known, trust = (pooled(maps, size)[:, :, None] for maps in (self.known, self.confidence))
+        return ViewInputs(latent, known, trust, self.geometry.rays, self.geometry.pose)
 
 
 def frame_geometry(
     targets: Sequence[Camera], sources: Sequence[Camera], ground_z_m: float, config: GeneratorConfig
-) -> FrameGeometry:
-    """The geometry of one frame (B = 1), whose N targets, S sources and road lie in one ego frame."""
-    size = config.latent_size
-    viewed = (
-        [(target, sources[nearest_sources(target, sources)[0]]) for target in targets],
-        [(source, source) for source in sources],
-    )
-    rays = [torch.stack([plucker_rays(*pair, size) for pair in pairs])[None] for pairs in viewed]
-    poses = [torch.stack([pose_vector(*pair) for pair in pairs])[None] for pairs in viewed]
-    keys, count = [*sources, *targets], len(sources)
-    settings = token_sizes(size, len(config.unet.widths)), ground_z_m
-    return FrameGeometry(
-        rays[0],
-        poses[0],
-        rays[1],
-        poses[1],
-        correspondences(targets, keys, range(count, len(keys)), *settings),
-        correspondences(sources, sources, range(count), *settings),
-    )
+) -> tuple[BranchGeometry, BranchGeometry]:
+    """The targets' and the sources' geometry of one frame (B = 1); cameras and road lie in one ego frame."""
+    size, keys, count = config.latent_size, [*sources, *targets], len(sources)
+    grids = token_sizes(size, len(config.unet.widths))
+    references = [sources[nearest_sources(target, sources)[0]] for target in targets]
 
+    def branch(cameras: Sequence[Camera], references: Sequence[Camera], reads: list[Correspondence]) -> BranchGeometry:
+        pairs = list(zip(cameras, references, strict=True))
+        rays, poses = [plucker_rays(*pair, size) for pair in pairs], [pose_vector(*pair) for pair in pairs]
+        return BranchGeometry(torch.stack(rays)[None], torch.stack(poses)[None], reads)
 
-def batched(frames: Sequence[FrameGeometry]) -> FrameGeometry:
-    """One geometry of frames with equal numbers of targets and of sources."""
-    *tensors, target_reads, source_reads = zip(*frames, strict=True)
-    reads = ([stacked(grid) for grid in zip(*grids, strict=True)] for grids in (target_reads, source_reads))
-    return FrameGeometry._make([*map(torch.cat, tensors), *reads])
+    return (
+        branch(targets, references, correspondences(targets, keys, range(count, len(keys)), grids, ground_z_m)),
+        branch(sources, sources, correspondences(sources, sources, range(count), grids, ground_z_m)),
+    )

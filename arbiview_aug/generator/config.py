@@ -27,14 +27,14 @@ def check_fields(
             raise error(f"{type(config).__name__}.{name}: expected {expected}, got {shown(value)}")
 
 
-def check_sizes(config: Any, most: int, *names: str) -> None:
-    """Raise GeneratorError for a field that is not a whole number from 0 to ``most``, or several of them."""
+def check_sizes(config: Any, least: int, most: int, *names: str) -> None:
+    """Raise GeneratorError for a field that is not a whole number from ``least`` to ``most``, or several of them."""
 
     def valid(value: Any) -> bool:
         parts = value if isinstance(value, tuple) else (value,)
-        return len(parts) <= _MOST_LEVELS and all(type(part) is int and 0 <= part <= most for part in parts)
+        return len(parts) <= _MOST_LEVELS and all(type(part) is int and least <= part <= most for part in parts)
 
-    check_fields(config, f"whole numbers up to {most}, at most {_MOST_LEVELS} of them", valid, *names)
+    check_fields(config, f"whole numbers from {least} to {most}, at most {_MOST_LEVELS} of them", valid, *names)
 
 
 _Config = TypeVar("_Config")
@@ -86,15 +86,14 @@ class UNetConfig:
     norm_groups: int = 32
 
     def __post_init__(self) -> None:
-        check_sizes(self, _MOST_CHANNELS, "widths", "context_width", "heads", "norm_groups")
-        check_sizes(self, _MOST_LAYERS, "layers")
+        check_sizes(self, 1, _MOST_CHANNELS, "widths", "context_width", "heads", "norm_groups")
+        check_sizes(self, 1, _MOST_LAYERS, "layers")
         widths, count = self.widths, len(self.widths)
-        check_fields(self, "multiples of 32", lambda w: bool(w) and all(n > 0 and n % 32 == 0 for n in w), "widths")
+        check_fields(self, "multiples of 32", lambda w: bool(w) and not any(n % 32 for n in w), "widths")
         check_fields(self, f"{count} values", lambda t: len(t) == count, "transformers")
         expected = f"{count} values, one of them true"
         check_fields(self, expected, lambda c: not c or (len(c) == count and any(c)), "cross_view")
-        check_fields(self, "at least 1", lambda n: n >= 1, "layers", "context_width", "norm_groups")
-        check_fields(self, f"{count} values above 0", lambda h: not h or (len(h) == count and all(h)), "heads")
+        check_fields(self, f"{count} values", lambda h: len(h) in (0, count), "heads")
         check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
 
     def arguments(self, in_channels: int, out_channels: int) -> dict[str, Any]:
@@ -123,11 +122,10 @@ class AutoencoderConfig:
     scale: float = 1.0  # factor that gives latents unit variance
 
     def __post_init__(self) -> None:
-        check_sizes(self, _MOST_CHANNELS, "widths", "patch", "latent_channels", "norm_groups")
-        check_sizes(self, _MOST_LAYERS, "layers")
+        check_sizes(self, 1, _MOST_CHANNELS, "widths", "patch", "latent_channels", "norm_groups")
+        check_sizes(self, 1, _MOST_LAYERS, "layers")
         widths, pixels = self.widths, 3 * self.patch**2
-        check_fields(self, "at least 1", lambda n: n >= 1, "layers", "norm_groups")
-        check_fields(self, "1, or more without widths", lambda p: p == 1 or (p > 1 and not widths), "patch")
+        check_fields(self, "1, or more without widths", lambda p: p == 1 or not widths, "patch")
         check_fields(self, f"{pixels}, 3 patch²", lambda c: bool(widths) or c == pixels, "latent_channels")
         check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
         check_fields(self, "a positive number", lambda scale: 0 < scale < math.inf, "scale")
@@ -171,11 +169,12 @@ class GeneratorConfig:
     temperature: float = 0.5  # deviation of the initial noise; at 1 samples are less accurate than the posterior's mean
 
     def __post_init__(self) -> None:
-        check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens")
+        check_sizes(self, 1, _MOST_PIXELS, "image_size")
+        check_sizes(self, 0, _MOST_PIXELS, "prompt_tokens")
         factor, epsilon = self.autoencoder.factor, self.prediction == "epsilon"
-        expected = f"two multiples of {factor}"
-        check_fields(self, expected, lambda size: isinstance(size, tuple) and len(size) == 2, "image_size")
-        check_fields(self, expected, lambda size: all(n > 0 and n % factor == 0 for n in size), "image_size")
+        fits = f"two multiples of {factor}"
+        check_fields(self, fits, lambda size: isinstance(size, tuple) and len(size) == 2, "image_size")
+        check_fields(self, fits, lambda size: not any(n % factor for n in size), "image_size")
         check_fields(self, " or ".join(get_args(Prediction)), lambda p: p in get_args(Prediction), "prediction")
         expected = "False with prediction 'epsilon', or prediction 'v_prediction'"
         check_fields(self, expected, lambda used: not (used and epsilon), "zero_snr", "residual")
@@ -190,15 +189,6 @@ class GeneratorConfig:
         """(h, w) of the latents."""
         h, w = self.image_size
         return h // self.autoencoder.factor, w // self.autoencoder.factor
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainedOn:
-    """The data that a generator was trained on."""
-
-    data: str  # ``synthetic``, or ``KIND:PATH`` with the absolute path
-    seed: int  # of the streets, and of the split
-    held_out: tuple[int, ...]  # frames that it never saw
 
 
 # --- presets ----------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ first and composed with them afterwards: their outputs start at zero, so the U-N
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -43,17 +44,18 @@ class Denoiser(nn.Module):
 
     Args:
         unet: A diffusers ``UNet2DConditionModel`` as ``UNetConfig`` describes; ``conv_in`` is widened by zeros.
-        config: Its ``prompt_tokens`` and ``unet.cross_view`` are read.
-        signal: (T,) √ᾱ_t of the schedule: the network then predicts the residual between image and condition. None
-            leaves its output unchanged, for Stable Diffusion's weights.
+        config: With ``residual`` the network predicts the residual between image and condition.
     """
 
+    signal: torch.Tensor | None = (
+        None  # (T,) √ᾱ_t of the schedule, if ``residual``; half precision would round a buffer
+    )
     deviation: torch.Tensor  # (2,) of the residual inside holes and outside; measured before training
 
-    def __init__(self, unet: Any, config: GeneratorConfig, signal: torch.Tensor | None = None) -> None:
+    def __init__(self, unet: Any, config: GeneratorConfig) -> None:
         super().__init__()
-        self.latent_channels = int(unet.config.out_channels)
-        widen(unet, input_channels(self.latent_channels))
+        latent_channels = int(unet.config.out_channels)
+        widen(unet, input_channels(latent_channels))
         self.unet = unet
         widths = tuple(unet.config.block_out_channels)
         used = config.unet.cross_view or (True,) * len(widths)
@@ -62,12 +64,13 @@ class Denoiser(nn.Module):
             {str(k): CrossViewAttention(width, len(LEVELS)) for k, (width, is_used) in enumerate(blocks) if is_used}
         )
         self.context = PoseContext(int(unet.config.cross_attention_dim), config.prompt_tokens)
-        self.regression = nn.Conv2d(widths[0], self.latent_channels, 3, padding=1)
+        self.regression = nn.Conv2d(widths[0], latent_channels, 3, padding=1)
         nn.init.zeros_(self.regression.weight)
         nn.init.zeros_(self.regression.bias)  # type: ignore[arg-type]
         self.gradient_checkpointing = False
-        self.signal = signal  # no buffer: half precision would round it
-        if signal is not None:
+        if config.residual:
+            with torch.device("cpu"):  # also where the weights are on meta
+                self.signal = noise_schedule(config).alphas_cumprod.double().sqrt().float()
             self.register_buffer("deviation", torch.tensor([0.3, 0.1]))
             nn.init.zeros_(unet.conv_out.weight)
             nn.init.zeros_(unet.conv_out.bias)
@@ -80,10 +83,8 @@ class Denoiser(nn.Module):
     def read_sources(self, sources: ViewInputs, windows: Sequence[TokenWindow]) -> Sources:
         """Run the source branches, which read sources only; ``windows``: one for each token grid, the finest first."""
         t = torch.zeros(len(sources.latent), dtype=torch.long, device=sources.latent.device)
-        outputs: Sources = []
         clean = sources.latent if self.signal is None else torch.zeros_like(sources.latent)  # their residual is 0
-        self._run(clean, t, sources, windows, None, outputs, None)
-        return outputs
+        return self._run(clean, t, sources, windows)[1]
 
     def forward(
         self,
@@ -114,7 +115,7 @@ class Denoiser(nn.Module):
             condition = targets.latent.float()
             z = (noisy.float() - a * condition) / root
             x = z.masked_fill(is_regression, 0)
-        h = self._run(x, t, targets, windows, sources, None, rows)
+        h, _ = self._run(x, t, targets, windows, sources, rows)
         unet = self.unet
         if unet.conv_norm_out is not None:
             h = unet.conv_act(unet.conv_norm_out(h))
@@ -154,33 +155,29 @@ class Denoiser(nn.Module):
         t: torch.Tensor,
         views: ViewInputs,
         windows: Sequence[TokenWindow],
-        sources: Sources | None,
-        outputs: Sources | None,
-        rows: list[Rows] | None,
-    ) -> torch.Tensor:
-        """Run all blocks of the U-Net; a source run appends its keys and values to ``outputs``."""
+        sources: Sources | None = None,
+        rows: list[Rows] | None = None,
+    ) -> tuple[torch.Tensor, Sources]:
+        """Run all blocks of the U-Net; also returns the views' keys and values. Sources end at their last ones."""
         unet, count = self.unet, noisy.shape[:2]
         x = views.channels(noisy).flatten(0, 1).to(unet.dtype)
         emb = unet.time_embedding(unet.time_proj(t.repeat_interleave(count[1])).to(unet.dtype))
         context = self.context(views.pose.flatten(0, 1))
-        blocks, attended = 0, 0  # blocks of the U-Net so far, and cross-view blocks
+        blocks = itertools.count()
+        keys_values: Sources = []
 
         def attend(h: torch.Tensor, window: TokenWindow) -> torch.Tensor:
-            nonlocal blocks, attended
-            name, blocks = str(blocks), blocks + 1
+            name = str(next(blocks))
             if name not in self.cross_view:
                 return h
-            others = None if sources is None else sources[attended]
-            block = self.cross_view[name]
-            assert isinstance(block, CrossViewAttention)
-            attended += 1
-            if outputs is not None and attended == len(self.cross_view):  # nothing is decoded of a source
-                outputs.append(block.keys_values(_tokens(h, count)))
+            block: Any = self.cross_view[name]
+            if sources is None and len(keys_values) == len(self.cross_view) - 1:  # nothing is decoded of a source
+                keys_values.append(block.keys_values(_tokens(h, count)))
                 return h
+            others = None if sources is None else sources[len(keys_values)]
             h, tokens, predicted = self._checkpointed(_read_views, block, h, window, others, count, rows is not None)
-            if outputs is not None:
-                outputs.append(tokens)
-            if rows is not None and predicted is not None:
+            keys_values.append(tokens)
+            if rows is not None:
                 rows.append(Rows(predicted, window.bilinear(), window.place // window.valid[0, 0, 0].numel()))
             return h
 
@@ -199,11 +196,11 @@ class Denoiser(nn.Module):
             skips, inner = skips[: -len(block.resnets)], skips[-len(block.resnets) :]
             h = self._checkpointed(_layers, block, h, emb, context, inner)[-1]
             h = attend(h, window)
-            if outputs is not None and attended == len(self.cross_view):
+            if sources is None and len(keys_values) == len(self.cross_view):
                 break
             if block.upsamplers is not None:
                 h = block.upsamplers[0](h, skips[-1].shape[-2:])  # odd sizes need to be told
-        return h
+        return h, keys_values
 
     def _checkpointed(self, function: Callable[..., Any], *arguments: Any) -> Any:
         if self.gradient_checkpointing and torch.is_grad_enabled():
@@ -287,20 +284,18 @@ class Autoencoder(nn.Module):
         self.scale = float(scale)  # of the latents; no buffer, since half precision would round it
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
-        """Encode images (..., 3, H, W) in [0, 1] to latents (..., C, H / f, W / f), without sampling."""
+        """Encode images (B, N, 3, H, W) in [0, 1] to latents (B, N, C, H / f, W / f), without sampling."""
         images = images * 2 - 1
         if self.vae is None:
             return functional.pixel_unshuffle(images, self.patch)
-        flat = images.reshape(-1, *images.shape[-3:]).to(self.vae.dtype)
-        latents = self.vae.encode(flat).latent_dist.mode() * self.scale
-        return latents.reshape(*images.shape[:-3], *latents.shape[-3:])
+        latents = self.vae.encode(images.flatten(0, 1).to(self.vae.dtype)).latent_dist.mode() * self.scale
+        return latents.unflatten(0, images.shape[:2])
 
     def decode(self, latents: torch.Tensor) -> torch.Tensor:
-        """Decode latents (..., C, h, w) to images (..., 3, H, W), in [0, 1] up to over- and undershoot."""
+        """Decode latents (B, N, C, h, w) to images (B, N, 3, H, W), in [0, 1] up to over- and undershoot."""
         if self.vae is None:
             images = functional.pixel_shuffle(latents, self.patch)
         else:
-            flat = latents.reshape(-1, *latents.shape[-3:]).to(self.vae.dtype)
-            images = self.vae.decode(flat / self.scale).sample
-            images = images.reshape(*latents.shape[:-3], *images.shape[-3:])
+            flat = latents.flatten(0, 1).to(self.vae.dtype) / self.scale
+            images = self.vae.decode(flat).sample.unflatten(0, latents.shape[:2])
         return images / 2 + 0.5

@@ -19,8 +19,8 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, one_line, shown
 from arbiview_aug.files import check_regular
 from arbiview_aug.generator.conditioning import input_channels
-from arbiview_aug.generator.config import PRESETS, GeneratorConfig, TrainedOn, from_plain
-from arbiview_aug.generator.denoiser import Autoencoder, Denoiser, noise_schedule
+from arbiview_aug.generator.config import PRESETS, GeneratorConfig, from_plain
+from arbiview_aug.generator.denoiser import Autoencoder, Denoiser
 
 _EMPTY_PROMPT = [49406, *[49407] * 76]  # CLIP's tokens of "": start of text, then end of text up to 77
 _FREE = ("sample_size", "upcast_attention", "force_upcast", "scaling_factor")  # not compared: they change no layer
@@ -36,20 +36,20 @@ class Generator(nn.Module):
     """Generator of the pixels that no camera saw: a denoiser and an autoencoder (Sec. CVC-SSL).
 
     ``from_pretrained`` loads one, ``from_config`` and ``from_stable_diffusion`` create untrained ones. ``to`` moves it
-    to a GPU or to bfloat16. ``unet`` and ``vae`` (or None) are diffusers' networks, ``signal`` is as for ``Denoiser``.
+    to a GPU or to bfloat16. ``unet`` and ``vae`` (or None) are diffusers' networks.
     """
 
-    def __init__(self, config: GeneratorConfig, unet: Any, vae: Any | None, signal: torch.Tensor | None = None) -> None:
+    def __init__(self, config: GeneratorConfig, unet: Any, vae: Any | None) -> None:
         super().__init__()
         self.config = config
-        self.denoiser = Denoiser(unet, config, signal)
+        self.denoiser = Denoiser(unet, config)
         self.autoencoder = Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch)
         if config.frozen_unet:
             self.requires_grad_(False)
             for parameter in self.denoiser.own_parameters():
                 parameter.requires_grad_(True)
         self.calls = 0  # of the denoiser, while sampling
-        self.trained_on: TrainedOn | None = None  # set by the training, and read from a folder
+        self.trained_on: dict[str, Any] | None = None  # by the trainer: data, seed of the split, frames held out
 
     @property
     def device(self) -> torch.device:
@@ -63,33 +63,22 @@ class Generator(nn.Module):
         latent = config.autoencoder.latent_channels
         unet = unet_class(**config.unet.arguments(input_channels(latent), latent))
         vae = vae_class(**config.autoencoder.arguments()) if config.autoencoder.widths else None
-        with torch.device("cpu"):  # also where the weights are on meta
-            alphas = noise_schedule(config).alphas_cumprod
-        signal = alphas.double().sqrt().float() if config.residual else None
-        return cls(config, unet, vae, signal)
+        return cls(config, unet, vae)
 
     @classmethod
-    def from_stable_diffusion(
-        cls,
-        where: str | Path,
-        config: GeneratorConfig | None = None,
-        *,
-        empty_prompt: torch.Tensor | None = None,
-    ) -> Generator:
+    def from_stable_diffusion(cls, where: str | Path, config: GeneratorConfig = PRESETS["paper"]) -> Generator:
         """Create an untrained generator with Stable Diffusion's weights.
 
         At first it has the output of Stable Diffusion for a context of the empty prompt and one more token, the pose's.
 
         Args:
             where: A folder or hub id in diffusers' layout.
-            config: Settings, ``PRESETS["paper"]`` by default; the weights must fit.
-            empty_prompt: (prompt tokens, width) the text encoder's last hidden state for ""; by default computed by the
-                folder's text encoder, which needs transformers.
+            config: Settings; the weights must fit. With ``prompt_tokens`` the text encoder is read too, which needs
+                transformers.
 
         Raises:
             GeneratorError: Weights that are missing, extra, of another architecture, or trained for another prediction.
         """
-        config = config or PRESETS["paper"]
         latent = config.autoencoder.latent_channels
         if not config.autoencoder.widths:
             raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
@@ -105,15 +94,13 @@ class Generator(nn.Module):
             needed = f"prediction_type {config.prediction!r}, as of config {config.name!r}"
             raise GeneratorError(f"{where}/scheduler: expected {needed}, got {shown(prediction)}")
         config = replace(config, autoencoder=replace(config.autoencoder, scale=float(scale)))
-        if empty_prompt is None and config.prompt_tokens:
-            empty_prompt = embedded_empty_prompt(where)
         generator = cls(config, unet, vae).eval()
-        if empty_prompt is not None:
-            prompt = generator.denoiser.context.empty_prompt
-            if empty_prompt.shape != prompt.shape:
-                expected, got = tuple(prompt.shape), tuple(empty_prompt.shape)
-                raise GeneratorError(f"empty_prompt: expected shape {expected}, got {got}")
-            prompt.copy_(empty_prompt)
+        if config.prompt_tokens:
+            prompt, embedded = generator.denoiser.context.empty_prompt, embedded_empty_prompt(where)
+            if embedded.shape != prompt.shape:
+                shapes = f"{tuple(prompt.shape)}, got {tuple(embedded.shape)}"
+                raise GeneratorError(f"{where}/text_encoder: expected an empty prompt of shape {shapes}")
+            prompt.copy_(embedded)
         return generator
 
     # --- folders ------------------------------------------------------------------------------------------------------
@@ -130,10 +117,20 @@ class Generator(nn.Module):
         _networks()
         with torch.device("meta"):
             generator = cls.from_config(config)
+        for name, expected in generator.state_dict().items():
+            tensor = tensors.get(name, expected.new_zeros(0, device="cpu"))  # missing names are torch's to report
+            if tensor.is_floating_point() != expected.is_floating_point():
+                raise GeneratorError(f"{folder}: {name}: expected {expected.dtype} or alike, got {tensor.dtype}")
+            if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+                fault = "expected finite weights, got NaN or infinity: training diverged"
+                raise GeneratorError(f"{folder}: {name}: {fault}")
         weights = {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}
-        load_weights(generator, weights, folder)
-        if data.get("trained_on") is not None:
-            generator.trained_on = from_plain(TrainedOn, data["trained_on"], str(folder))
+        try:
+            generator.load_state_dict(weights, assign=True)
+        except RuntimeError as error:
+            text = one_line(error, _MAX_MESSAGE)
+            raise GeneratorError(f"{folder}: expected the weights of this configuration: {text}") from None
+        generator.trained_on = data.get("trained_on")
         # Inside a user's module its parameters must not be found by the optimiser or DDP.
         return generator.eval().requires_grad_(False)
 
@@ -145,7 +142,7 @@ class Generator(nn.Module):
         """
         config = {"generator": asdict(self.config)}
         if self.trained_on is not None:
-            config["trained_on"] = asdict(self.trained_on)
+            config["trained_on"] = self.trained_on
         write_checkpoint(Path(folder), config, self.state_dict())
 
 
@@ -183,24 +180,6 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tenso
     if version != _FORMAT:
         raise GeneratorError(f"{path}: expected format {_FORMAT}, got {shown(version)}")
     return config, tensors
-
-
-def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path) -> None:
-    """Replace the tensors of a module by exactly its weights.
-
-    GeneratorError for names that are missing, extra or of another shape, and for values that are not finite.
-    """
-    for name, expected in module.state_dict().items():
-        tensor = tensors.get(name, expected.new_zeros(0, device="cpu"))  # missing names are torch's to report
-        if tensor.is_floating_point() != expected.is_floating_point():
-            raise GeneratorError(f"{folder}: {name}: expected {expected.dtype} or alike, got {tensor.dtype}")
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-            raise GeneratorError(f"{folder}: {name}: expected finite weights, got NaN or infinity: training diverged")
-    try:
-        module.load_state_dict(tensors, assign=True)
-    except RuntimeError as error:
-        text = one_line(error, _MAX_MESSAGE)
-        raise GeneratorError(f"{folder}: expected the weights of this configuration: {text}") from None
 
 
 # --- Stable Diffusion's weights ---------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ from arbiview_aug.errors import CalibrationError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.generator import read_checkpoint, write_checkpoint
 from arbiview_aug.generator.training.config import TrainConfig
-from arbiview_aug.generator.training.trainer import load_state
+from arbiview_aug.generator.training.trainer import RunState
 from arbiview_aug.image_ops import Memory
 from arbiview_aug.sample.batching import is_readable
 from arbiview_aug.temporal.motion_depth import MotionDepth
@@ -153,7 +153,7 @@ class Boundaries:
 
     def _read_generator(self, _: Path) -> None:
         with contextlib.suppress(ArbiviewError):
-            load_state(self.generator, asdict(self.training), {}, {}, mock.Mock(shadow_params=[]), self.optimiser)
+            RunState(self.generator, asdict(self.training), {}, {}, mock.Mock(shadow_params=[]), self.optimiser).load()
         Generator.from_pretrained(self.generator)
 
     def _go_on(self) -> None:

@@ -114,9 +114,9 @@ def changed(*path: str, to: Any) -> Any:
         (changed("generator", "colour", to=1), "expected keys among .*got colour"),
         (changed("generator", "unet", "context_width", to=768), r"size mismatch for denoiser.unet.*\[\d+, 768\]"),
         # absurd sizes, before they are built
-        (changed("generator", "unet", "layers", to=10**9), "layers: expected whole numbers up to"),
-        (changed("generator", "image_size", to=[10**7, 10**7]), "image_size: expected whole numbers up to"),
-        (changed("generator", "prompt_tokens", to=-1), "prompt_tokens: expected whole numbers up to"),
+        (changed("generator", "unet", "layers", to=10**9), "layers: expected whole numbers from 1 to 16"),
+        (changed("generator", "image_size", to=[10**7, 10**7]), "image_size: expected whole numbers from 1 to"),
+        (changed("generator", "prompt_tokens", to=-1), "prompt_tokens: expected whole numbers from 0 to"),
         # other types
     ],
 )
@@ -148,7 +148,7 @@ LEVELS: dict[str, Any] = {"widths": (32, 32), "transformers": (False, True)}
         (UNetConfig, {**LEVELS, "cross_view": (False, False)}, "cross_view: expected 2 values, one of them true"),
         (UNetConfig, {"widths": (48,), "transformers": (True,)}, "expected multiples of 32"),
         *(
-            (UNetConfig, {**LEVELS, n: 0}, f"{n}: expected at least 1")
+            (UNetConfig, {**LEVELS, n: 0}, f"{n}: expected whole numbers from 1 to")
             for n in ("layers", "context_width", "norm_groups")
         ),
     ],

@@ -15,12 +15,12 @@ from arbiview_aug.generator.attention import (
     FACING_M,
     HEAD_WIDTH,
     CrossViewAttention,
-    PositionalEncoding,
     TokenWindow,
     correspond,
     correspondences,
+    joined,
     plane_vectors,
-    stacked,
+    positional_encoding,
     window,
 )
 from tests.generator.small import ring, stirred
@@ -127,7 +127,7 @@ def block(width: int = WIDTH, levels: int = 3) -> CrossViewAttention:
 
 def windows(rig: Rig, size: tuple[int, int], copies: int = 1) -> TokenWindow:
     reads = correspondences(list(rig), list(rig), range(len(rig)), [size], rig.ground_z_m)[0]
-    return window(stacked([reads] * copies), len(rig))
+    return window(joined([reads] * copies), len(rig))
 
 
 def features(at: TokenWindow, views: int, seed: int = 0) -> torch.Tensor:
@@ -137,7 +137,7 @@ def features(at: TokenWindow, views: int, seed: int = 0) -> torch.Tensor:
 
 def test_the_encoding_is_the_papers() -> None:
     """concat(sin(W1 Δp), cos(W2 Δp)); at Δp = 0 the sines are 0 and the cosines 1."""
-    encoding = PositionalEncoding()
+    encoding = positional_encoding
     frequencies = [math.pi / 16 * 16 ** (k / 7) for k in range(8)]  # up to π: what a grid of whole tokens tells apart
     W = torch.tensor([[f, 0.0] for f in frequencies] + [[0.0, f] for f in frequencies])
     delta = torch.tensor([[0.0, 0.0], [0.5, -1.25]])
@@ -180,7 +180,7 @@ def test_attention_is_the_formula() -> None:
                             q = queries[0, i, p, part]
                             logits = torch.stack([
                                 q @ (keys[0, j, ty * w + tx, part]
-                                     + layer.positions(torch.tensor([tx, ty]) - centre)) / math.sqrt(32)
+                                     + positional_encoding(torch.tensor([tx, ty]) - centre)) / math.sqrt(32)
                                 for tx, ty in inside
                             ])  # fmt: skip
                             attention = torch.softmax(logits, 0)
@@ -197,7 +197,8 @@ def test_attention_is_the_formula() -> None:
                     attended[0, i, p] = (weight * torch.stack(outputs)).sum(0).flatten()
         gate = at.read[..., None].float()
         expected = x + gate * layer.to_out(attended)
-        expected = expected + gate * layer.feed(layer.feed_norm(expected))
+        value, by = layer.feed["inner"](layer.feed_norm(expected)).chunk(2, -1)
+        expected = expected + gate * layer.feed["outer"](value * torch.nn.functional.gelu(by))
     assert torch.allclose(got, expected, atol=1e-4)
     assert len(rows) == len(predicted) == len(at.place)
     order = torch.stack([predicted[key] for key in sorted(predicted)])  # places are sorted the same way

@@ -13,11 +13,11 @@ from diffusers import UNet2DConditionModel
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.attention import token_sizes
+from arbiview_aug.generator.attention import TokenWindow, joined, mapped, token_sizes
 from arbiview_aug.generator.conditioning import (
-    FrameGeometry,
+    Branches,
+    BranchGeometry,
     ViewInputs,
-    batched,
     frame_geometry,
     nearest_sources,
     plucker_rays,
@@ -26,27 +26,31 @@ from arbiview_aug.generator.conditioning import (
 from arbiview_aug.generator.denoiser import REGRESSION, Denoiser, Rows
 from tests.generator.small import ring, small_config
 
+Geometry = tuple[BranchGeometry, BranchGeometry]  # of the targets, and of the sources
 
-def views(geometry: FrameGeometry, of: str, seed: int = 0, channels: int = 3) -> ViewInputs:
-    rays = geometry.target_rays if of == "target" else geometry.source_rays
-    b, n, _, h, w = rays.shape
+
+def views(geometry: BranchGeometry, seed: int = 0, channels: int = 3) -> ViewInputs:
+    b, n, _, h, w = geometry.rays.shape
     rng = torch.Generator().manual_seed(seed)
     latent = torch.randn(b, n, channels, h, w, generator=rng)
-    make = geometry.target_views if of == "target" else geometry.source_views
     mask = torch.rand(b, n, h, w, generator=rng) < 0.7
-    return make(latent, mask, mask * torch.rand(b, n, h, w, generator=rng))
+    return Branches(latent, mask, mask * torch.rand(b, n, h, w, generator=rng), geometry).inputs(latent)
 
 
-def run(denoiser: Denoiser, geometry: FrameGeometry, t: int = 400, seed: int = 0, rows: list[Rows] | None = None):
-    targets, sources = views(geometry, "target", seed), views(geometry, "source", seed + 1)
+def target_windows(geometry: Geometry, dropped: torch.Tensor | None = None) -> list[TokenWindow]:
+    return geometry[0].windows(geometry[1].pose.shape[1], dropped)
+
+
+def run(denoiser: Denoiser, geometry: Geometry, t: int = 400, seed: int = 0, rows: list[Rows] | None = None):
+    targets, sources = views(geometry[0], seed), views(geometry[1], seed + 1)
     noisy = torch.randn(targets.latent.shape, generator=torch.Generator().manual_seed(seed + 2))
-    read = denoiser.read_sources(sources, geometry.source_windows())
+    read = denoiser.read_sources(sources, geometry[1].windows())
     time = torch.full((len(noisy),), t)
-    return denoiser(noisy, time, targets, geometry.target_windows(), read, rows)
+    return denoiser(noisy, time, targets, target_windows(geometry), read, rows)
 
 
 @pytest.fixture
-def geometry() -> FrameGeometry:
+def geometry() -> Geometry:
     sources = ring(4, horizontal_fov_deg=100)
     targets = ring(4, horizontal_fov_deg=120, yaw_deg=20, name="t")
     return frame_geometry(list(targets)[:2], list(sources), 0.0, small_config())
@@ -57,15 +61,15 @@ def geometry() -> FrameGeometry:
 def test_untrained_attention_leaves_the_plain_unet(size: tuple[int, int], checkpointing: bool) -> None:
     """Difference 0, also at odd sizes and under gradient checkpointing; the conditions enter by zero weights."""
     torch.manual_seed(0)
-    config = small_config(image_size=size)
+    config = small_config(image_size=size, residual=False)
     plain = UNet2DConditionModel(**config.unet.arguments(3, 3))
     denoiser = Denoiser(copy.deepcopy(plain), config)
     denoiser.gradient_checkpointing = checkpointing
     geometry = frame_geometry(list(ring(3, name="t")), list(ring(3)), 0.0, config)
-    targets = views(geometry, "target")
+    targets = views(geometry[0])
     noisy = torch.randn(targets.latent.shape)
-    read = denoiser.read_sources(views(geometry, "source"), geometry.source_windows())
-    got = denoiser(noisy, torch.tensor([400]), targets, geometry.target_windows(), read)
+    read = denoiser.read_sources(views(geometry[1]), geometry[1].windows())
+    got = denoiser(noisy, torch.tensor([400]), targets, target_windows(geometry), read)
     context = denoiser.context(targets.pose[0])
     expected = plain(noisy[0], 400, encoder_hidden_states=context).sample
     assert torch.allclose(got[0], expected, atol=1e-5)
@@ -80,16 +84,16 @@ def test_every_parameter_takes_part_in_every_step(generator: Generator) -> None:
         assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in denoiser.parameters())
 
 
-def test_targets_read_sources_and_targets(generator: Generator, geometry: FrameGeometry) -> None:
+def test_targets_read_sources_and_targets(generator: Generator, geometry: Geometry) -> None:
     denoiser, t = generator.denoiser, torch.tensor([400])
-    targets, sources = views(geometry, "target"), views(geometry, "source", 1)
+    targets, sources = views(geometry[0]), views(geometry[1], 1)
     noisy = torch.randn(targets.latent.shape, generator=torch.Generator().manual_seed(2))
     with torch.no_grad():
-        read = denoiser.read_sources(sources, geometry.source_windows())
-        windows = geometry.target_windows()
+        read = denoiser.read_sources(sources, geometry[1].windows())
+        windows = target_windows(geometry)
         base = denoiser(noisy, t, targets, windows, read)
         other = sources._replace(latent=sources.latent + 1)
-        changed = denoiser(noisy, t, targets, windows, denoiser.read_sources(other, geometry.source_windows()))
+        changed = denoiser(noisy, t, targets, windows, denoiser.read_sources(other, geometry[1].windows()))
         assert (changed - base).abs().max() > 1e-3
         noisy_too = noisy.clone()
         noisy_too[:, 1] += 1
@@ -98,8 +102,8 @@ def test_targets_read_sources_and_targets(generator: Generator, geometry: FrameG
         # Without sources, as classifier-free guidance has it, nothing of them is left.
         dropped = torch.tensor([True])
         alone = [
-            denoiser(noisy, t, targets.dropped(dropped), geometry.target_windows(dropped), keys)
-            for keys in (read, denoiser.read_sources(other, geometry.source_windows()))
+            denoiser(noisy, t, targets.dropped(dropped), target_windows(geometry, dropped), keys)
+            for keys in (read, denoiser.read_sources(other, geometry[1].windows()))
         ]
         assert torch.equal(*alone)
 
@@ -111,16 +115,16 @@ def test_permuting_the_cameras_permutes_the_output(generator: Generator) -> None
     order, source_order = [4, 2, 0, 3, 1], [2, 3, 1, 0]
     base = frame_geometry(list(targets), list(sources), 0.0, config)
     moved = frame_geometry([targets[k] for k in order], [sources[k] for k in source_order], 0.0, config)
-    of_targets, of_sources = views(base, "target"), views(base, "source", 1)
+    of_targets, of_sources = views(base[0]), views(base[1], 1)
     noisy = torch.randn(of_targets.latent.shape, generator=torch.Generator().manual_seed(2))
     with torch.no_grad():
-        read = denoiser.read_sources(of_sources, base.source_windows())
-        expected = denoiser(noisy, t, of_targets, base.target_windows(), read)[:, order]
+        read = denoiser.read_sources(of_sources, base[1].windows())
+        expected = denoiser(noisy, t, of_targets, target_windows(base), read)[:, order]
         of_sources = ViewInputs(*(value[:, source_order] for value in of_sources))
         of_targets = ViewInputs(*(value[:, order] for value in of_targets))
-        assert torch.allclose(of_targets.pose, moved.target_pose)
-        read = denoiser.read_sources(of_sources, moved.source_windows())
-        got = denoiser(noisy[:, order], t, of_targets, moved.target_windows(), read)
+        assert torch.allclose(of_targets.pose, moved[0].pose)
+        read = denoiser.read_sources(of_sources, moved[1].windows())
+        got = denoiser(noisy[:, order], t, of_targets, target_windows(moved), read)
     assert torch.allclose(got, expected, atol=2e-5)
 
 
@@ -133,13 +137,13 @@ def test_any_number_of_views_on_the_smallest_grids_is_finite(
     for size in ((1, 1), (1, 2), (3, 5)):
         config = small_config(image_size=size)
         geometry = frame_geometry(list(ring(count, name="t", yaw_deg=3)), list(ring(count)), 0.0, config)
-        assert [w.valid.shape[-1] for w in geometry.target_windows()] == [h * w for h, w in token_sizes(size, 2)]
+        assert [w.valid.shape[-1] for w in target_windows(geometry)] == [h * w for h, w in token_sizes(size, 2)]
         with torch.no_grad():
             out = run(denoiser, geometry)
         assert out.shape == (1, count, 3, *size) and torch.isfinite(out).all()
 
 
-def test_rows_for_the_geometric_loss(generator: Generator, geometry: FrameGeometry) -> None:
+def test_rows_for_the_geometric_loss(generator: Generator, geometry: Geometry) -> None:
     """One entry a block; rows sum to 1; of untrained attention they are about uniform (1/3 off for a whole window)."""
     torch.manual_seed(0)
     fresh = Generator.from_config(small_config()).denoiser
@@ -165,7 +169,7 @@ def test_an_untrained_residual_network_is_the_best_linear_guess(t: int) -> None:
     denoiser = Generator.from_config(config).denoiser
     denoiser.deviation.copy_(torch.tensor([0.4, 0.1]))
     geometry = frame_geometry(list(ring(3, name="t")), list(ring(3)), 0.0, config)
-    targets = views(geometry, "target")
+    targets = views(geometry[0])
     targets = targets._replace(mask=targets.mask.round())
     signal = denoiser.signal
     assert signal is not None
@@ -177,9 +181,9 @@ def test_an_untrained_residual_network_is_the_best_linear_guess(t: int) -> None:
 
     def x0_of(r: torch.Tensor) -> torch.Tensor:
         x = a * (targets.latent + r) + s * eps
-        read = denoiser.read_sources(views(geometry, "source"), geometry.source_windows())
+        read = denoiser.read_sources(views(geometry[1]), geometry[1].windows())
         with torch.no_grad():
-            v = denoiser(x, torch.tensor([t]), targets, geometry.target_windows(), read)
+            v = denoiser(x, torch.tensor([t]), targets, target_windows(geometry), read)
         return a * x - s * v
 
     share = (a * deviation) ** 2 / ((a * deviation) ** 2 + s**2)
@@ -234,14 +238,14 @@ def test_frames_of_different_rigs_make_a_batch() -> None:
     config = small_config()
     close, apart = ring(4, radius_m=0.0, horizontal_fov_deg=120), ring(4, horizontal_fov_deg=120)
     frames = [frame_geometry([rig[0]], [rig[1], rig[3]], 0.0, config) for rig in (close, apart)]
-    both = batched(frames)
-    assert both.target_rays.shape == (2, 1, 6, 6, 10) and both.source_pose.shape == (2, 2, 16)
-    assert [c.valid.shape[-2:] for c in both.target_reads] == [(6, 10), (3, 5)]
-    assert both.target_reads[0].valid.shape[3] == 3 and frames[0].target_reads[0].valid.shape[3] == 1
+    targets, sources = both = joined(frames)
+    assert targets.rays.shape == (2, 1, 6, 6, 10) and sources.pose.shape == (2, 2, 16)
+    assert [c.valid.shape[-2:] for c in targets.reads] == [(6, 10), (3, 5)]
+    assert targets.reads[0].valid.shape[3] == 3 and frames[0][0].reads[0].valid.shape[3] == 1
     for k, frame in enumerate(frames):
-        count = int(frame.target_reads[0].valid.sum())
-        assert int(both.target_reads[0].valid[k].sum()) == count > 0
-    dropped = both.target_windows(torch.tensor([True, False]))
+        count = int(frame[0].reads[0].valid.sum())
+        assert int(targets.reads[0].valid[k].sum()) == count > 0
+    dropped = target_windows(both, torch.tensor([True, False]))
     assert not dropped[0].valid[0].any() and dropped[0].valid[1].any()
-    moved = both.to("cpu")
-    assert torch.equal(moved.target_rays, both.target_rays)
+    moved = mapped(lambda tensor: tensor + 1, both)
+    assert torch.equal(moved[1].reads[1].centre, sources.reads[1].centre + 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,7 @@ def config() -> GeneratorConfig:
             heads=(2, 2, 2, 2), norm_groups=8,
         ),
         autoencoder=AutoencoderConfig(widths=(16, 16, 16, 16), layers=1, latent_channels=4, norm_groups=8),
-        prediction="epsilon", zero_snr=False, residual=False, frozen_unet=True, prompt_tokens=5,
+        prediction="epsilon", zero_snr=False, residual=False, frozen_unet=True,
     )  # fmt: skip
 
 
@@ -104,8 +105,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_folder_is_loaded_and_computes_what_it_did(folder: Path, tmp_path: Path) -> None:
-    prompt = torch.randn(5, 24)
-    made = Generator.from_stable_diffusion(folder, config(), empty_prompt=prompt)
+    made = Generator.from_stable_diffusion(folder, config())
     plain = UNet2DConditionModel.from_pretrained(folder, subfolder="unet")
     expected = plain.state_dict()
     assert list(expected) == list(made.denoiser.unet.state_dict())
@@ -113,7 +113,6 @@ def test_a_folder_is_loaded_and_computes_what_it_did(folder: Path, tmp_path: Pat
         assert torch.equal(value[:, :4] if name == "conv_in.weight" else value, expected[name]), name
     assert not made.denoiser.unet.conv_in.weight[:, 4:].any()
     assert made.autoencoder.scale == 0.18215
-    assert torch.equal(made.denoiser.context.empty_prompt, prompt)
     trained = {name for name, p in made.named_parameters() if p.requires_grad}
     assert {name.split(".")[1] for name in trained} == {"unet", "cross_view", "context", "regression"}
     assert {name for name in trained if ".unet." in name} == {
@@ -130,7 +129,7 @@ def test_a_folder_is_loaded_and_computes_what_it_did(folder: Path, tmp_path: Pat
 
 def refused(folder: Path, match: str) -> None:
     with pytest.raises(GeneratorError, match=match):
-        Generator.from_stable_diffusion(folder, config(), empty_prompt=torch.zeros(5, 24))
+        Generator.from_stable_diffusion(folder, config())
 
 
 def test_weights_that_do_not_fit_are_named(folder: Path) -> None:
@@ -185,14 +184,12 @@ def test_folders_as_they_were_published_are_read(folder: Path) -> None:
         (folder / part / "config.json").write_text(json.dumps(given))
     (folder / "scheduler").mkdir()
     (folder / "scheduler" / "scheduler_config.json").write_text(json.dumps({"_class_name": "PNDMScheduler"}))
-    made = Generator.from_stable_diffusion(folder, own, empty_prompt=torch.zeros(5, 24))
+    made = Generator.from_stable_diffusion(folder, own)
     assert made.autoencoder.scale == 0.18215
 
 
-def test_missing_folders_and_prompts_are_named(folder: Path, tmp_path: Path) -> None:
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     refused(tmp_path / "nothing", "expected a diffusers folder or hub id with a UNet2DConditionModel")
-    with pytest.raises(GeneratorError, match=r"empty_prompt: expected shape \(5, 24\), got \(77, 24\)"):
-        Generator.from_stable_diffusion(folder, config(), empty_prompt=torch.zeros(77, 24))
 
 
 def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path) -> None:
@@ -212,6 +209,10 @@ def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path) -> No
     with torch.no_grad():
         expected = encoder(torch.tensor([[49406, *[49407] * 76]])).last_hidden_state[0]
     assert torch.allclose(embedded_empty_prompt(folder), expected, atol=1e-5)
+    made = Generator.from_stable_diffusion(folder, replace(config(), prompt_tokens=77))
+    assert torch.allclose(made.denoiser.context.empty_prompt, expected, atol=1e-5)
+    with pytest.raises(GeneratorError, match=r"text_encoder: .* empty prompt of shape \(5, 24\), got \(77, 24\)"):
+        Generator.from_stable_diffusion(folder, replace(config(), prompt_tokens=5))
     layer = [name for name in good if "layers.1." in name]
     exactly = "text_encoder: expected exactly the weights of this CLIPTextModel; "
     for tensors, match in (

@@ -115,15 +115,14 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
         group: Any = data
         for part in groups:
             group = group.get(part) if isinstance(group, dict) else None
-        if not equals or not isinstance(group, dict) or isinstance(group.get(last, {}), dict):
-            keys = (group if isinstance(group, dict) else data).items()
-            known = ", ".join(f"{key}.…" if isinstance(value, dict) else key for key, value in keys)
-            raise TrainingError(f"--set {setting}: expected KEY=VALUE, such as loss.geo=0, with a key of {known}")
+        if not equals or not isinstance(group, dict):
+            groups_named = ", ".join(f"{key}.…" for key, value in data.items() if isinstance(value, dict))
+            raise TrainingError(f"--set {setting}: expected KEY=VALUE, such as loss.geo=0, or {groups_named}")
         try:
             group[last] = json.loads(text)
         except ValueError:
             group[last] = text.strip()  # a string without quotes
-    return from_plain(TrainConfig, data, "config", TrainingError)
+    return from_plain(TrainConfig, data, "--set", TrainingError)
 
 
 # --- presets ----------------------------------------------------------------------------------------------------------

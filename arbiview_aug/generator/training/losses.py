@@ -16,42 +16,34 @@ from torch import nn
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.files import open_regular
+from arbiview_aug.generator.completion import encoded
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows, noise_schedule
 from arbiview_aug.generator.training.config import GeoMode, TrainConfig
 from arbiview_aug.generator.training.pseudo_views import Batch
 
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, on which VGG16 was trained
 VGG_LAYERS = (3, 8, 15, 22)  # relu1_2, 2_2, 3_3, 4_3 of torchvision's vgg16 (Johnson et al. 2016); λ_l = 1/4
 
 
 class ForwardProcess:
-    """The noising x_t = a x0 + s ε, a = √ᾱ_t, s = √(1 − ᾱ_t), of a generator's schedule ᾱ."""
+    """The noising x_t = a x0 + s ε, a = √ᾱ_t, s = √(1 − ᾱ_t), of a generator's schedule ᾱ; times t are (B,)."""
 
     def __init__(self, config: GeneratorConfig) -> None:
         alphas = noise_schedule(config).alphas_cumprod.double()
         self.signal, self.noise = alphas.sqrt().float(), (1 - alphas).sqrt().float()
-        self.prediction = config.prediction
+        self.is_epsilon = config.prediction == "epsilon"
 
-    def _at(self, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """a and s at t (B,), (B, 1, 1, 1, 1)."""
+    def noised(self, x0: torch.Tensor, eps: torch.Tensor, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """x_t (B, N, C, h, w) of x0 and ε, and the target of its prediction: ε, or v = a ε − s x0 (Salimans & Ho)."""
         a, s = (values.to(t.device)[t].view(-1, 1, 1, 1, 1) for values in (self.signal, self.noise))
-        return a, s
-
-    def noisy(self, x0: torch.Tensor, eps: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        """x_t (B, N, C, h, w) of x0 and ε at t (B,)."""
-        a, s = self._at(t)
-        return a * x0 + s * eps
-
-    def target(self, x0: torch.Tensor, eps: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        """The prediction target: ε, or v = a ε − s x0 (Salimans & Ho 2022)."""
-        a, s = self._at(t)
-        return eps if self.prediction == "epsilon" else a * eps - s * x0
+        return a * x0 + s * eps, eps if self.is_epsilon else a * eps - s * x0
 
     def x0(self, x: torch.Tensor, predicted: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         """Estimate x0 from the prediction at x_t; inaccurate at late t with ε."""
-        a, s = self._at(t)
-        return (x - s * predicted) / a.clamp(min=1e-4) if self.prediction == "epsilon" else a * x - s * predicted
+        a, s = (values.to(t.device)[t].view(-1, 1, 1, 1, 1) for values in (self.signal, self.noise))
+        return (x - s * predicted) / a.clamp(min=1e-4) if self.is_epsilon else a * x - s * predicted
 
 
 def masked_mse(predicted: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -81,21 +73,14 @@ def geometric_loss(rows: Sequence[Rows], mode: GeoMode) -> torch.Tensor:
 class Perceptual(nn.Module):
     """L_perceptual = Σ_l λ_l ‖φ_l(pred) − φ_l(target)‖₂ with VGG16, each norm divided by √(number of features)."""
 
-    mean: torch.Tensor
-    std: torch.Tensor
-
     def __init__(self, features: nn.Sequential) -> None:
         super().__init__()
-        self.features = nn.Sequential(*list(features.children())[: VGG_LAYERS[-1] + 1]).eval().requires_grad_(False)
-        for layer in self.features:
-            if isinstance(layer, nn.ReLU):
-                layer.inplace = False
-        self.register_buffer("mean", torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1))
-        self.register_buffer("std", torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1))
+        self.features = features[: VGG_LAYERS[-1] + 1].eval().requires_grad_(False)
 
     def forward(self, predicted: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """(n,) distances of images (n, 3, h, w) in [0, 1], h, w >= 8; the target needs no gradient."""
-        x, y = ((image.float() - self.mean) / self.std for image in (predicted, target))
+        mean, std = (predicted.new_tensor(level, dtype=torch.float32)[:, None, None] for level in (MEAN, STD))
+        x, y = ((image.float() - mean) / std for image in (predicted, target))
         distance = predicted.new_zeros(len(predicted), dtype=torch.float32)
         for k, layer in enumerate(self.features):
             x = layer(x)
@@ -166,21 +151,20 @@ class Step(nn.Module):
         """Compute ``main``, ``regression``, ``geo`` and, if asked for, ``perceptual``: without their weights."""
         config, loss = self.config, self.config.loss
         autoencoder, vgg = self._frozen
-        geometry = batch.geometry
         with torch.no_grad():
             x0 = autoencoder.encode(batch.truth).float()
-            views, source_views = batch.conditions.encoded(config.generator, autoencoder, geometry)
+            views, source_views = encoded(config.generator, autoencoder, batch.targets, batch.sources)
         size = (x0.shape[-2], x0.shape[-1])
         valid = (pooled(batch.valid, size) > 0.99).float()[:, :, None]
-        pixel_weight = valid * (1 - (1 - loss.known_weight) * pooled(batch.known, size)[:, :, None])
+        pixel_weight = valid * (1 - (1 - loss.known_weight) * pooled(batch.targets.known, size)[:, :, None])
         is_regression = draws.t == REGRESSION
         t, regressed = draws.t.clamp(max=TIMESTEPS - 1), is_regression.view(-1, 1, 1, 1, 1)
-        noisy = self.diffusion.noisy(x0, draws.eps, t)
-        start = torch.where(regressed, views.latent, noisy)
-        target = torch.where(regressed, x0, self.diffusion.target(x0, draws.eps, t))
-        views, windows = views.dropped(draws.drop), geometry.target_windows(draws.drop)
+        noisy, target = self.diffusion.noised(x0, draws.eps, t)
+        start, target = torch.where(regressed, views.latent, noisy), torch.where(regressed, x0, target)
+        views = views.dropped(draws.drop)
+        windows = batch.targets.geometry.windows(batch.sources.images.shape[1], draws.drop)
         rows: list[Rows] | None = [] if loss.geo else None
-        sources = self.denoiser.read_sources(source_views, geometry.source_windows())
+        sources = self.denoiser.read_sources(source_views, batch.sources.geometry.windows())
         predicted = self.denoiser(start, draws.t, views, windows, sources, rows).float()
         unit = self.denoiser.output_scale(draws.t, views)
         error = masked_mse(predicted / unit, target / unit, pixel_weight)

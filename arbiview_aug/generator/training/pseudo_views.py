@@ -12,7 +12,6 @@ Item k is drawn from (seed, k) alone: a resumed run, or one with other workers, 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,8 +31,9 @@ from arbiview_aug.datasets.registry import READERS, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.favs.renderer import as_rendered, render_paper
-from arbiview_aug.generator.completion import Conditions, unit, valid_pixels
-from arbiview_aug.generator.conditioning import SOURCES_PER_TARGET, FrameGeometry, batched, frame_geometry
+from arbiview_aug.generator.attention import joined, mapped
+from arbiview_aug.generator.completion import unit, valid_pixels
+from arbiview_aug.generator.conditioning import SOURCES_PER_TARGET, Branches, frame_geometry
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
 from arbiview_aug.image_ops import resized
@@ -140,38 +140,29 @@ class Batch(NamedTuple):
     truth: torch.Tensor  # (B, N, 3, H, W) the real views
     valid: torch.Tensor  # (B, N, H, W) bool, the pixels that count: no own car, nothing that moves
     favs: torch.Tensor  # (B, N, 3, H, W) the pseudo views rendered at the target poses, black in holes
-    condition: torch.Tensor  # (B, N, 3, H, W) the same, with holes filled as by default
-    known: torch.Tensor  # (B, N, H, W) bool, coverage of ``favs``
-    confidence: torch.Tensor  # (B, N, H, W) in [0, 1]
-    sources: torch.Tensor  # (B, S, 3, H, W)
-    seen: torch.Tensor  # (B, S, H, W) bool, valid pixels of the sources
-    geometry: FrameGeometry  # of their cameras
+    targets: Branches  # the same, with holes filled as by default
+    sources: Branches  # the pseudo views
     tokens: tuple[str, ...]  # names of the items
 
     def to(self, device: torch.device | str) -> Batch:
-        return Batch._make([*(value.to(device) for value in self[:-1]), self.tokens])
-
-    @property
-    def conditions(self) -> Conditions:
-        return Conditions(self.condition, self.known, self.confidence, self.sources, self.seen)
+        return Batch(*mapped(lambda tensor: tensor.to(device, non_blocking=True), self[:-1]), self.tokens)
 
     @property
     def holes(self) -> torch.Tensor:
         """(B, N, H, W) bool: valid pixels that no pseudo view shows."""
-        return self.valid & ~self.known
+        return self.valid & ~self.targets.known
 
 
 def collate(items: Sequence[Batch]) -> Batch:
     """One batch of items with as many targets and sources; TrainingError, which names the frame, if they have not."""
     for item in items:
-        expected, got = (views.sources.shape[1] for views in (items[0], item))  # one more than targets, where possible
+        expected, got = (views.sources.images.shape[1] for views in (items[0], item))  # one more than targets, at best
         if got != expected:
             fix = "train on frames of as many cameras, or with fewer pseudo_views.targets"
             raise TrainingError(
                 f"frame {item.tokens[0]}: expected {expected} pseudo views as in others, got {got}: {fix}"
             )
-    *tensors, geometries, tokens = zip(*items, strict=True)
-    return Batch._make([*map(torch.cat, tensors), batched(geometries), tuple(itertools.chain(*tokens))])
+    return Batch(*joined([item[:-1] for item in items]), tuple(token for item in items for token in item.tokens))
 
 
 def rendered(frame: Frame, targets: Sequence[Camera], quality: PseudoQuality = "fast") -> Views:
@@ -229,16 +220,13 @@ class PseudoViews(Dataset[Batch]):
         sources, seen = torch.stack(pseudo.images)[nearest], seen[nearest]
         moving = frame.further["moving"]
         valid = [valid_pixels(without_objects(rig[i], moving)).to(self.device) for i in places]
+        geometry = frame_geometry(targets, [masked[i] for i in nearest], rig.ground_z_m, self.generator)
         return Batch(
             torch.stack([unit(frame.images[i]) for i in places])[None],
             torch.stack(valid)[None],
             favs[None],
-            torch.stack(filled.images)[None],
-            known[None],
-            (confidence.float() * known)[None],
-            (sources * seen[:, None])[None],
-            seen[None],
-            frame_geometry(targets, [masked[i] for i in nearest], rig.ground_z_m, self.generator),
+            Branches(torch.stack(filled.images)[None], known[None], (confidence.float() * known)[None], geometry[0]),
+            Branches((sources * seen[:, None])[None], seen[None], seen[None], geometry[1]),
             (f"{frame.further['token']}/{rig[first].name}/{k}",),
         )
 

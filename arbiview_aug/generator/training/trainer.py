@@ -9,9 +9,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, OutputError, TrainingError, one_line, shown
 from arbiview_aug.generator.completion import denoised, shown_condition
 from arbiview_aug.generator.conditioning import pooled
-from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.generator.generator import FILE, Generator, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.losses import Perceptual, Step, draw, load_perceptual
@@ -90,36 +89,34 @@ class Trainer:
         generator.autoencoder.requires_grad_(False)
         generator.denoiser.gradient_checkpointing = config.checkpointing
         self.split = frames.split(config.seed)
-        generator.trained_on = TrainedOn(data=frames.name, seed=config.seed, held_out=tuple(self.split.held_out))
+        generator.trained_on = {"data": frames.name, "seed": config.seed, "held_out": self.split.held_out}
         self.perceptual = perceptual.to(self.device) if config.loss.perceptual and perceptual is not None else None
         self.step = Step(config, generator.denoiser, generator.autoencoder, self.perceptual)
-        self.trained = {n: p for n, p in generator.denoiser.named_parameters() if p.requires_grad}
-        if not self.trained:
+        trained = {n: p for n, p in generator.denoiser.named_parameters() if p.requires_grad}
+        if not trained:
             raise TrainingError(
                 "Trainer: expected weights to train, got a generator that is frozen, as from_pretrained loads it: call "
                 "generator.denoiser.requires_grad_(True), with frozen_unet on each of own_parameters() alone"
             )
-        self.optimiser = torch.optim.AdamW(self.trained.values(), lr=config.lr, weight_decay=config.weight_decay)
+        optimiser = torch.optim.AdamW(trained.values(), lr=config.lr, weight_decay=config.weight_decay)
         ema = optional_package("diffusers.training_utils", "generator").EMAModel
-        self.average = ema(self.trained.values(), decay=config.ema, foreach=True)
         frozen: list[torch.Tensor] = [p for p in generator.parameters() if not p.requires_grad]
         frozen += [generator.denoiser.context.empty_prompt, *(self.perceptual.parameters() if self.perceptual else ())]
-        self._run = {
+        run = {
             **asdict(config),
-            "data": asdict(generator.trained_on),
+            "data": generator.trained_on,
             "frozen weights": digest_of(frozen),
             "number of processes": self.accelerator.num_processes,
         }
-        self._buffers = {"deviation": generator.denoiser.deviation} if config.generator.residual else {}
-        self.done, state = 0, self.output / "state"
-        is_resumed = has_state(self.output)
+        buffers = {"deviation": generator.denoiser.deviation} if config.generator.residual else {}
+        average = ema(trained.values(), decay=config.ema, foreach=True)
+        self.state = RunState(self.output / "state", run, trained, buffers, average, optimiser)
+        self.done, is_resumed = 0, has_state(self.output)
         if is_resumed:
-            self.done = load_state(state, self._run, self.trained, self._buffers, self.average, self.optimiser)
-            self.say(f"going on after step {self.done} of {state}")
+            self.done = self.state.load()
+            self.say(f"going on after step {self.done} of {self.state.folder}")
         # The optimiser is not placed: AdamW's step counters on a GPU would synchronise one by one.
-        self.model, self._optimiser = self.accelerator.prepare(
-            self.step, self.optimiser, device_placement=[True, False]
-        )
+        self.model, self._optimiser = self.accelerator.prepare(self.step, optimiser, device_placement=[True, False])
         shared, first = (config.pseudo_views, config.generator), 10 * config.seed
         maker = "cpu" if config.workers else self.device
         self.items = PseudoViews(frames, self.split.training, *shared, first + _SEEDS["items"], maker)
@@ -137,9 +134,9 @@ class Trainer:
         sums = torch.zeros(2, 2, dtype=torch.float64)
         for k in range(_DEVIATION_ITEMS):
             batch = self.items[k].to(self.device)
-            shown = shown_condition(self.config.generator, batch.condition, batch.known)
+            shown = shown_condition(self.config.generator, batch.targets)
             squared = (encode(batch.truth) - encode(shown)).float().square().mean(2)
-            known, valid = (pooled(maps, size) > 0.99 for maps in (batch.known, batch.valid))
+            known, valid = (pooled(maps, size) > 0.99 for maps in (batch.targets.known, batch.valid))
             for row, pixels in enumerate((valid & ~known, valid & known)):
                 sums[row] += torch.stack([squared[pixels].sum(), pixels.sum()]).cpu()
         deviation = (sums[:, 0] / sums[:, 1].clamp(min=1)).sqrt().clamp(min=_MIN_DEVIATION)
@@ -172,34 +169,30 @@ class Trainer:
             self.save()
 
     def train_step(self, batch: Batch) -> dict[str, float]:
-        """Update the weights once; returns the loss terms, TrainingError if one or the gradient is not finite."""
+        """Update the weights once; returns loss terms and the gradient's norm. TrainingError if one is not finite."""
         config = self.config
         number = self.done * self.accelerator.num_processes + self.accelerator.process_index
         rng = torch.Generator().manual_seed((10 * config.seed + _SEEDS["draws"]) * 2**32 + number)
         batch = batch.to(self.device)
-        for group in self.optimiser.param_groups:
+        for group in self.state.optimiser.param_groups:
             group["lr"] = learning_rate(config, self.done)
         with_perceptual = self.perceptual is not None and self.done % config.loss.perceptual_every == 0
         terms = self.model(batch, draw(config, batch, rng), with_perceptual)
         total = self.step.total(terms)
-        numbers = torch.stack([*terms.values(), total]).detach().tolist()  # one synchronisation with a GPU
-        values = dict(zip((*terms, "total"), numbers, strict=True))
-        self._check_finite({f"loss term {name}": value for name, value in values.items()}, batch)
         self.accelerator.backward(total)
         norm = self.accelerator.clip_grad_norm_(self.model.parameters(), config.max_grad_norm or math.inf)
-        self._check_finite({"the norm of the gradient": float(norm)}, batch)
-        self._optimiser.step()
-        self._optimiser.zero_grad(set_to_none=True)
-        self.average.step(self.trained.values())
-        return values
-
-    def _check_finite(self, values: dict[str, float], batch: Batch) -> None:
+        numbers = torch.stack([*terms.values(), total, norm]).detach().tolist()  # one synchronisation with a GPU
+        values = dict(zip((*terms, "total", "gradient_norm"), numbers, strict=True))
         for name, value in values.items():
             if not math.isfinite(value):
                 raise TrainingError(
-                    f"step {self.done}: {name} is {value}; the batch: {', '.join(batch.tokens)}. The last saved state "
-                    "is from before; try a lower lr, or bf16 off"
+                    f"step {self.done}: expected finite losses and gradients, got {name} {value}; the batch: "
+                    f"{', '.join(batch.tokens)}. The last saved state is from before; try a lower lr, or bf16 off"
                 )
+        self._optimiser.step()
+        self._optimiser.zero_grad(set_to_none=True)
+        self.state.average.step(self.state.parameters.values())
+        return values
 
     def _batches(self) -> Iterator[Batch]:
         config, world = self.config, self.accelerator.num_processes
@@ -221,9 +214,8 @@ class Trainer:
         """Write the state, and the generator with averaged weights; after an OutputError the last is unchanged."""
         try:
             if self.is_main:
-                kept = self.trained, self._buffers, self.average, self.optimiser
-                save_state(self.output / "state", self._run, self.done, *kept)
-                with averaged(self.average, self.trained.values()):
+                self.state.save(self.done)
+                with self.state.averaged():
                     self.generator.save_pretrained(self.output / "generator")
         finally:  # the other processes wait in any case
             self.accelerator.wait_for_everyone()
@@ -233,8 +225,8 @@ class Trainer:
         config, steps = self.config, max(2, self.config.generator.steps)
         if self.is_main:
             batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
-            methods = {"condition": batch.condition}
-            with averaged(self.average, self.trained.values()):
+            methods = {"condition": batch.targets.images}
+            with self.state.averaged():
                 if config.loss.regression:
                     methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
                 methods[f"{steps}_steps"] = sampled(self.generator, batch, steps=steps, seed=0)
@@ -261,8 +253,8 @@ def sampled(generator: Generator, batch: Batch, *, steps: int, seed: int, pasted
     config = replace(generator.config, steps=steps)
     size = (*batch.truth.shape[:2], config.autoencoder.latent_channels, *config.latent_size)
     noise = torch.randn(size, generator=torch.Generator().manual_seed(seed)).to(batch.truth.device)
-    images = denoised(generator, config, batch.geometry, batch.conditions, noise).clamp(0, 1)
-    return torch.where(batch.known[:, :, None], batch.favs, images) if pasted else images
+    images = denoised(generator, config, batch.targets, batch.sources, noise).clamp(0, 1)
+    return torch.where(batch.targets.known[:, :, None], batch.favs, images) if pasted else images
 
 
 def hole_psnr(images: torch.Tensor, truth: torch.Tensor, holes: torch.Tensor) -> torch.Tensor:
@@ -273,39 +265,6 @@ def hole_psnr(images: torch.Tensor, truth: torch.Tensor, holes: torch.Tensor) ->
 
 
 # --- the state of a run ----------------------------------------------------------------------------------------------
-@contextmanager
-def averaged(average: Any, parameters: Iterable[nn.Parameter]) -> Iterator[None]:
-    """Put the weights of diffusers' ``EMAModel`` into the parameters for a while."""
-    average.store(parameters := list(parameters))
-    average.copy_to(parameters)
-    try:
-        yield
-    finally:
-        average.restore(parameters)
-
-
-def save_state(
-    folder: Path,
-    run: Mapping[str, Any],
-    step: int,
-    parameters: Mapping[str, nn.Parameter],
-    buffers: Mapping[str, torch.Tensor],
-    average: Any,
-    optimiser: torch.optim.Optimizer,
-) -> None:
-    """Write the state after ``step`` steps; OutputError if it fails, and the last state is unchanged.
-
-    ``run`` is plain data that must be the same in a resumed run. Accelerate's ``save_state`` pickles, and writes into
-    the folder in place.
-    """
-    tensors = {f"weights.{name}": parameter.detach() for name, parameter in parameters.items()}
-    tensors |= {f"buffers.{name}": value for name, value in buffers.items()}
-    tensors |= {f"average.{name}": value for name, value in zip(parameters, average.shadow_params, strict=True)}
-    for k, state in optimiser.state_dict()["state"].items():
-        tensors |= {f"optimiser.{k}.{key}": torch.as_tensor(value) for key, value in state.items()}
-    write_checkpoint(folder, {"step": step, "training": run}, tensors)
-
-
 def has_state(output: Path) -> bool:
     """Whether a run's folder has a state to resume from; TrainingError for a generator without one.
 
@@ -322,48 +281,67 @@ def has_state(output: Path) -> bool:
     return False
 
 
-def load_state(
-    folder: Path,
-    run: Mapping[str, Any],
-    parameters: Mapping[str, nn.Parameter],
-    buffers: Mapping[str, torch.Tensor],
-    average: Any,
-    optimiser: torch.optim.Optimizer,
-) -> int:
-    """Load a saved state into a run; returns its steps. TrainingError for another ``run``, or a broken state."""
-    with _broken(folder):
-        data, tensors = read_checkpoint(folder)
-        before, step = dict(data["training"]), data["step"]
-    now = json.loads(json.dumps(run))
-    changed = [name for name in now | before if name not in _MAY_DIFFER and before.get(name) != now.get(name)]
-    if changed:
-        fix = "resume with the same ones, or give another --output"
-        raise TrainingError(f"{folder}: a run with other {', '.join(changed)}; {fix}")
-    with _broken(folder):
-        if type(step) is not int or not 0 <= step <= now["steps"]:
-            raise ValueError(f"step: expected 0 to {now['steps']}, got {shown(step)}")
-        for (name, parameter), shadow in zip(parameters.items(), average.shadow_params, strict=True):
-            parameter.data.copy_(tensors[f"weights.{name}"])
-            shadow.copy_(tensors[f"average.{name}"])
-        for name, buffer in buffers.items():
-            buffer.copy_(tensors[f"buffers.{name}"])
-        average.optimization_step = step
-        state: dict[int, dict[str, torch.Tensor]] = {}
-        for name, value in tensors.items():
-            if name.startswith("optimiser."):
-                _, k, key = name.split(".")
-                state.setdefault(int(k), {})[key] = value
-        optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
-    return step
+@dataclass
+class RunState:
+    """All that a run needs to be resumed. Accelerate's ``save_state`` pickles, and writes into the folder in place."""
 
+    folder: Path
+    run: Mapping[str, Any]  # plain data that must be the same in a resumed run
+    parameters: Mapping[str, nn.Parameter]
+    buffers: Mapping[str, torch.Tensor]
+    average: Any  # diffusers' ``EMAModel`` of the parameters
+    optimiser: torch.optim.Optimizer
 
-@contextmanager
-def _broken(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except (GeneratorError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        text = f"{one_line(error)}; delete it, or give another --output"
-        raise TrainingError(f"{folder}: expected the state of a training run: {text}") from None
+    def save(self, step: int) -> None:
+        """Write the state after ``step`` steps; OutputError if it fails, and the last state is unchanged."""
+        tensors = {f"weights.{name}": parameter.detach() for name, parameter in self.parameters.items()}
+        tensors |= {f"buffers.{name}": value for name, value in self.buffers.items()}
+        averages = zip(self.parameters, self.average.shadow_params, strict=True)
+        tensors |= {f"average.{name}": value for name, value in averages}
+        for k, state in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{k}.{key}": torch.as_tensor(value) for key, value in state.items()}
+        write_checkpoint(self.folder, {"step": step, "training": self.run}, tensors)
+
+    def load(self) -> int:
+        """Load the saved state; returns its steps. TrainingError for another ``run``, or a broken state."""
+        now = json.loads(json.dumps(self.run))
+        try:
+            data, tensors = read_checkpoint(self.folder)
+            before, step = dict(data["training"]), data["step"]
+            changed = [name for name in now | before if name not in _MAY_DIFFER and before.get(name) != now.get(name)]
+            if changed:
+                fix = "resume with the same ones, or give another --output"
+                raise TrainingError(f"{self.folder}: a run with other {', '.join(changed)}; {fix}")
+            if type(step) is not int or not 0 <= step <= now["steps"]:
+                raise ValueError(f"step: expected 0 to {now['steps']}, got {shown(step)}")
+            for (name, parameter), shadow in zip(self.parameters.items(), self.average.shadow_params, strict=True):
+                parameter.data.copy_(tensors[f"weights.{name}"])
+                shadow.copy_(tensors[f"average.{name}"])
+            for name, buffer in self.buffers.items():
+                buffer.copy_(tensors[f"buffers.{name}"])
+            self.average.optimization_step = step
+            states: dict[int, dict[str, torch.Tensor]] = {}
+            for name, value in tensors.items():
+                if name.startswith("optimiser."):
+                    _, k, key = name.split(".")
+                    states.setdefault(int(k), {})[key] = value
+            self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": states})
+        except TrainingError:
+            raise
+        except (GeneratorError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            text = f"{one_line(error)}; delete it, or give another --output"
+            raise TrainingError(f"{self.folder}: expected the state of a training run: {text}") from None
+        return step
+
+    @contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Put the averaged weights into the parameters for a while."""
+        self.average.store(self.parameters.values())
+        self.average.copy_to(self.parameters.values())
+        try:
+            yield
+        finally:
+            self.average.restore(self.parameters.values())
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

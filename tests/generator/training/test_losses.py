@@ -159,7 +159,8 @@ def test_only_holes_count_in_validation() -> None:
 
 def test_holes_of_the_condition_are_grey_as_published_or_filled() -> None:
     _, batch, _ = step_of(config(), [3, 400])
-    settings, known = config().generator, batch.known[:, :, None].expand_as(batch.condition)
-    grey = shown_condition(replace(settings, prefilled=False), batch.condition, batch.known)
-    assert bool((grey[~known] == 0.5).all()) and torch.equal(grey[known], batch.condition[known])
-    assert shown_condition(settings, batch.condition, batch.known) is batch.condition
+    settings, images = config().generator, batch.targets.images
+    known = batch.targets.known[:, :, None].expand_as(images)
+    grey = shown_condition(replace(settings, prefilled=False), batch.targets)
+    assert bool((grey[~known] == 0.5).all()) and torch.equal(grey[known], images[known])
+    assert shown_condition(settings, batch.targets) is images

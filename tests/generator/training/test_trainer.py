@@ -89,7 +89,10 @@ def test_a_loss_that_is_not_finite_names_the_term_and_the_batch(tmp_path: Path) 
     batch = next(made._batches())
     weights = {name: value.clone() for name, value in made.generator.denoiser.state_dict().items()}
     batch = batch._replace(truth=torch.full_like(batch.truth, float("nan")))
-    with pytest.raises(TrainingError, match=r"step 0: loss term main is nan; the batch: frame \d.*frame \d"):
+    with pytest.raises(
+        TrainingError,
+        match=r"step 0: expected finite .*, got main nan; the batch: frame \d.*frame \d",
+    ):
         made.train_step(batch)
     assert all(torch.equal(weights[name], value) for name, value in made.generator.denoiser.state_dict().items())
 
@@ -100,7 +103,9 @@ def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path, most: flo
     made = run(tmp_path, max_grad_norm=most)
     weights = {name: value.clone() for name, value in made.generator.denoiser.state_dict().items()}
     next(made.generator.denoiser.context.mlp.parameters()).register_hook(lambda gradient: gradient * math.inf)
-    with pytest.raises(TrainingError, match=r"step 0: the norm of the gradient is (nan|inf); the batch: frame \d"):
+    with pytest.raises(
+        TrainingError, match=r"step 0: expected finite .*, got gradient_norm (nan|inf); the batch: frame \d"
+    ):
         made.train_step(next(made._batches()))
     assert same(weights, made.generator.denoiser.state_dict())
 
@@ -194,14 +199,15 @@ def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path, monkey
 def test_a_full_disk_costs_a_save_and_log_lines_but_not_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, waited, save = run(tmp_path, save_every=1, steps=2), list[int](), trainer.save_state
+    made, waited = run(tmp_path, save_every=1, steps=2), list[int]()
+    save = made.state.save
 
-    def full(*arguments: Any) -> None:
-        if made.done < 2:
+    def full(step: int) -> None:
+        if step < 2:
             raise OutputError("No space left on device")
-        save(*arguments)
+        save(step)
 
-    monkeypatch.setattr(trainer, "save_state", full)
+    monkeypatch.setattr(made.state, "save", full)
     monkeypatch.setattr(made.accelerator, "wait_for_everyone", lambda: waited.append(1))  # nobody is left waiting
     (tmp_path / "log.jsonl").mkdir()
     made.train()
