@@ -12,7 +12,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -23,9 +22,9 @@ from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import repeatable_opencv
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.favs.stage1_geometry import check_pinhole, h_geom_of_visible
-from arbiview_aug.favs.stage2_features import NO_MATCHES, FeatureReport, Region, optimise_transformation, unmatched
-from arbiview_aug.favs.stage3_objects import AlignmentReport, align_objects, declined, find_objects
+from arbiview_aug.favs.stage1_geometry import check_pinhole, h_geom
+from arbiview_aug.favs.stage2_features import normalised, optimise_transformation, unmatched
+from arbiview_aug.favs.stage3_objects import align_objects, find_objects
 from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
 from arbiview_aug.render.harmonise import Harmoniser
 from arbiview_aug.render.rendered import Views, from_winners
@@ -39,8 +38,7 @@ class SourceReport:
     source: int  # index of the source camera in the source rig
     primary: bool  # whether it is the primary camera
     H_final: FloatArray  # (3, 3) source pixels to target pixels, det 1
-    features: FeatureReport  # result of stage 2
-    objects: AlignmentReport  # result of stage 3
+    reason: str  # results of stages 2 and 3
     share: float  # share of the target's pixels in which its weight is the largest
 
 
@@ -79,9 +77,7 @@ class PaperRendering:
         for camera, view in zip(self.target, self.targets, strict=True):
             lines.append(f"  {camera.name}: {view.coverage.mean():.1%} covered")
             for report in view.reports:
-                stages = f"features: {report.features.reason}; objects: {report.objects.reason}"
-                reason = "the primary camera, the reference of the others" if report.primary else stages
-                lines.append(f"    {report.share:6.1%} from {self.source[report.source].name}: {reason}")
+                lines.append(f"    {report.share:6.1%} from {self.source[report.source].name}: {report.reason}")
         return "\n".join(lines)
 
 
@@ -159,52 +155,42 @@ def _render_view(
     config: PaperConfig,
 ) -> PaperView:
     size, cameras = target.size, source.cameras
-    # Stage 1.
-    homographies = h_geom_of_visible(cameras, target)
-    warped = {
-        k: warp_perspective(arrays[k], homographies[k], size, cameras[k].mask) for k in order if k in homographies
-    }
+    # Stage 1, for the sources whose viewing cones meet the target's.
+    homographies, warped = dict[int, FloatArray](), dict[int, Warp]()
+    for k in order:
+        angle_rad = np.arccos(np.clip(cameras[k].cam2ego[:3, 2] @ target.cam2ego[:3, 2], -1, 1))
+        if angle_rad <= cameras[k].half_angle_rad + target.half_angle_rad:
+            homographies[k] = h_geom(cameras[k], target)
+            warped[k] = warp_perspective(arrays[k], homographies[k], size, cameras[k].mask)
     warps = {k: warp for k, warp in warped.items() if warp.coverage.any()}
     if not warps:
         nothing = np.full(size, -1, np.int8)
         return PaperView(torch.zeros(3, *size, dtype=dtype), nothing, (), _occluded(warped, nothing))
     # Stages 2 and 3.
     primary = primary_camera(cameras, target, list(warps))
-    reference = warps[primary]
-    reference_grey = _grey(reference.image)
-    results: dict[int, tuple[FeatureReport, AlignmentReport]] = {}
+    reference, results = warps[primary], dict[int, tuple[FloatArray, float, str]]()
     for k, warp in warps.items():
-        H = homographies[k]
+        base = unmatched(homographies[k], "feature matching is switched off")
         if k == primary:
-            features = unmatched(H, "it is the primary camera")
-            results[k] = features, declined(features.H_base, features.reason)
+            results[k] = base.H_base, base.quality, "the primary camera, the reference of the others"
             continue
-        matches = NO_MATCHES
         if config.use_feature_matching or config.use_object_alignment:
-            coverages, focal_ratio = (warp.coverage, reference.coverage), cameras[k].K[0, 0] / target.K[0, 0]
-            uv = warp.uv[warp.coverage]  # source pixels that the target shows
-            visible = Region(*map(int, (*np.floor(uv.min(0)), *np.ceil(uv.max(0)))))
-            features = optimise_transformation(
-                H, _grey(warp.image), reference_grey, coverages, visible, focal_ratio, config
-            )
-            matches = features.matches
-        if not config.use_feature_matching:
-            features = unmatched(H, "feature matching is switched off", matches)
+            focal_ratio = cameras[k].K[0, 0] / target.K[0, 0]
+            matched = optimise_transformation(homographies[k], warp, reference, focal_ratio, config)
+            base = matched if config.use_feature_matching else base._replace(matches=matched.matches)
+        H_final, objects = base.H_base, "object alignment is switched off"
         if config.use_object_alignment:
-            candidates = find_objects(matches, H, features.H_base, target, source.ground_z_m)
-            objects = align_objects(candidates, features.H_base, size[1], config)
-        else:
-            objects = declined(features.H_base, "object alignment is switched off")
-        results[k] = features, objects
+            candidates = find_objects(base.matches, homographies[k], base.H_base, target, source.ground_z_m)
+            H_final, objects = align_objects(candidates, base.H_base, size[1], config)
+        results[k] = H_final, base.quality, f"features: {base.reason}; objects: {objects}"
     # Stage 4.
-    for k, (features, objects) in results.items():
-        if features.case != "geometric" or objects.shift_px.any():
-            warps[k] = warp_perspective(arrays[k], objects.H_aligned, size, cameras[k].mask)
-    qualities = [features.quality for features, _ in results.values()]
-    fused, winners = adaptive_fusion(warps, qualities, primary, config)
+    for k, (H_final, *_) in results.items():
+        if not np.array_equal(H_final, normalised(homographies[k])):
+            warps[k] = warp_perspective(arrays[k], H_final, size, cameras[k].mask)
+    fused, winners = adaptive_fusion(warps, [quality for _, quality, _ in results.values()], primary, config)
     reports = tuple(
-        SourceReport(k, k == primary, objects.H_aligned, features, objects, float((winners == k).mean()))
-        for k, (features, objects) in results.items()
+        SourceReport(k, k == primary, H_final, reason, float((winners == k).mean()))
+        for k, (H_final, _, reason) in results.items()
     )
     planes = torch.from_numpy(np.ascontiguousarray(fused.transpose(2, 0, 1), np.float32))
     is_bytes = dtype == torch.uint8
@@ -236,10 +222,6 @@ def paper_labels(rendering: PaperRendering, labels: Sequence[torch.Tensor], fill
             out[..., torch.from_numpy(won)] = label[..., y, x]
         rendered.append(out)
     return rendered
-
-
-def _grey(image: Float32Image) -> npt.NDArray[np.uint8]:
-    return np.clip(np.round(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), 0, 255).astype(np.uint8)
 
 
 def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> Views:

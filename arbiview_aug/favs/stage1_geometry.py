@@ -14,7 +14,7 @@ The paper's R_i is ``cam2ego[:3, :3].T``: it takes ego directions to camera i. B
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -27,23 +27,9 @@ MAX_AREA_RATIO = 16.0  # largest change of area: beyond four times along each si
 
 
 def h_geom(source: Camera, target: Camera) -> FloatArray:
-    """Compute the (3, 3) rotation-only homography H_geom = K2 R2 R1⁻¹ K1⁻¹, exact at infinite depth.
-
-    CalibrationError for a camera that is not a pinhole camera.
-    """
-    check_pinhole((source, target))
+    """Compute the (3, 3) rotation-only homography H_geom = K2 R2 R1⁻¹ K1⁻¹ of pinhole cameras, exact at infinity."""
     R = target.cam2ego[:3, :3].T @ source.cam2ego[:3, :3]
     return target.K @ R @ np.linalg.inv(source.K)
-
-
-def h_geom_of_visible(sources: Sequence[Camera], target: Camera) -> dict[int, FloatArray]:
-    """Compute H_geom for the sources, by index, whose viewing cones meet the target's."""
-    homographies = {}
-    for k, source in enumerate(sources):
-        angle_rad = np.arccos(np.clip(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2], -1, 1))
-        if angle_rad <= source.half_angle_rad + target.half_angle_rad:
-            homographies[k] = h_geom(source, target)
-    return homographies
 
 
 def check_homography(H: FloatArray, size: tuple[int, int]) -> bool:
@@ -53,7 +39,7 @@ def check_homography(H: FloatArray, size: tuple[int, int]) -> bool:
     orientation, and enclose between 1 / ``MAX_AREA_RATIO`` and ``MAX_AREA_RATIO`` times the image's area. H and −H are
     the same homography, so the sign is taken from the image centre. ``size`` is (h, w) of the source image.
     """
-    if H.shape != (3, 3) or not np.isfinite(H).all():
+    if not np.isfinite(H).all():
         return False
     h, w = size
     corners = np.array([[0, 0, 1], [w - 1, 0, 1], [w - 1, h - 1, 1], [0, h - 1, 1]], dtype=np.float64)

@@ -6,7 +6,7 @@ Optimization":
 - {kp, des} = SIFT(I), good_matches = {m : d1 / d2 < 0.75}: ``match_features``.
 - H_feature = RANSAC(good_matches): ``estimate_homography``.
 - |good_matches| >= min_matches, check_homography(H_feature), consistency(H_geometric, H_feature) < threshold:
-  ``accept``, ``is_valid``, ``consistency``.
+  ``accept``, ``consistency``.
 - H_base = α H_geometric + (1 − α) H_feature, with α = 0, α = 1 or between: ``accept``.
 
 The reference is the primary camera's warp, so both images are in target pixels: RANSAC's M takes the warp to the
@@ -15,8 +15,8 @@ reference, and H_feature = M · H_geometric. Homographies map source pixels to t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,9 +25,10 @@ import numpy.typing as npt
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.stage1_geometry import check_homography
+from arbiview_aug.favs.stage4_fusion import Float32Image, Warp
+from arbiview_aug.image_ops import bounding_box
 
 GreyImage = npt.NDArray[np.uint8]
-Case = Literal["feature", "blended", "geometric"]
 
 REFERENCE_WIDTH_PX = 800  # target width at which ``PaperConfig`` states its lengths
 # Lengths named _PX are target pixels at that width.
@@ -37,20 +38,6 @@ _MIN_OVERLAP_PX = 16.0  # descriptors reach across narrower overlaps
 _RANSAC_PX = 2.0  # largest reprojection error of an inlier of M
 _NEIGHBOURS = 2  # the ratio test compares the nearest with the second-nearest
 _FLANN_LINEAR = 0  # exact; kd-trees depend on the state of OpenCV's random generator
-
-
-class Region(NamedTuple):
-    """Rectangle of pixels (x0, y0) to (x1, y1), both inclusive."""
-
-    x0: int
-    y0: int
-    x1: int
-    y1: int
-
-    @property
-    def corners(self) -> FloatArray:
-        """(4, 2) corner pixels, clockwise from the top left."""
-        return np.array([self[:2], (self.x1, self.y0), self[2:], (self.x0, self.y1)], dtype=np.float64)
 
 
 class Matches(NamedTuple):
@@ -63,23 +50,14 @@ class Matches(NamedTuple):
 NO_MATCHES = Matches(np.zeros((0, 2)), np.zeros((0, 2)))
 
 
-@dataclass(frozen=True)
-class FeatureReport:
+class BaseTransformation(NamedTuple):
     """Result of stage 2 for one source."""
 
     H_base: FloatArray  # (3, 3) homography for stage 3, det 1
-    case: Case  # the case of the paper's H_base
-    alpha: float  # α, the share of H_geometric: 0 for ``feature``, 1 for ``geometric``
-    good_matches: int  # number of matches that passed the ratio test
-    inliers: int  # number of them that agree with M, 0 without one
-    consistency_px: float | None  # largest corner motion between the two homographies; None without a valid H_feature
-    reason: str  # explanation of the case
+    alpha: float  # α, the share of H_geometric
+    quality: float  # of matching, in [0, 1]: the share of inliers among the good matches times the share of H_feature
     matches: Matches  # matches for stage 3 to cluster: the inliers of M, else all good ones
-
-    @property
-    def quality(self) -> float:
-        """Matching quality in [0, 1]: the share of inliers among the good matches times the share of H_feature."""
-        return (1 - self.alpha) * self.inliers / max(self.good_matches, 1)
+    reason: str  # explanation of α
 
 
 # --- equations --------------------------------------------------------------------------------------------------------
@@ -104,20 +82,6 @@ def consistency(H_geometric: FloatArray, H_feature: FloatArray, corners: FloatAr
 
 
 # --- matching ---------------------------------------------------------------------------------------------------------
-def overlap_region(coverage: BoolArray, neighbour: BoolArray, margin_px: int) -> Region | None:
-    """Bounding box of the overlap of two (h, w) coverages, grown by a margin inside the image; None without overlap."""
-    rows, columns = (np.flatnonzero((coverage & neighbour).any(axis)) for axis in (1, 0))
-    if not len(rows):
-        return None
-    h, w = coverage.shape
-    return Region(
-        max(int(columns[0]) - margin_px, 0),
-        max(int(rows[0]) - margin_px, 0),
-        min(int(columns[-1]) + margin_px, w - 1),
-        min(int(rows[-1]) + margin_px, h - 1),
-    )
-
-
 def match_features(warped: GreyImage, reference: GreyImage, usable: BoolArray, ratio: float) -> Matches:
     """Match SIFT features by FLANN and Lowe's ratio test, good_matches = {m : d1 / d2 < ratio}.
 
@@ -161,62 +125,49 @@ def estimate_homography(matches: Matches, ransac_px: float) -> tuple[FloatArray,
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
-def is_valid(H: FloatArray, visible: Region, scale: float) -> bool:
-    """Apply check_homography to the visible part of a source: its other corners may lie behind the target.
-
-    ``scale`` is source focal length over target focal length, so that a smaller target is no distortion.
-    """
-    shift = np.array([[1.0, 0.0, visible.x0], [0.0, 1.0, visible.y0], [0.0, 0.0, 1.0]])
-    size = visible.y1 - visible.y0 + 1, visible.x1 - visible.x0 + 1
-    return check_homography(np.diag([scale, scale, 1.0]) @ H @ shift, size)
-
-
 def optimise_transformation(
-    H_geometric: FloatArray,
-    warped: GreyImage,
-    reference: GreyImage,
-    coverages: tuple[BoolArray, BoolArray],
-    visible: Region,
-    focal_ratio: float,
-    config: PaperConfig,
-) -> FeatureReport:
+    H_geometric: FloatArray, warp: Warp, reference: Warp, focal_ratio: float, config: PaperConfig
+) -> BaseTransformation:
     """Run stage 2 for one source: match its warp to the reference and update the base transformation.
 
-    ``visible`` bounds the part of the source that the target shows, in source pixels; ``focal_ratio`` is its focal
-    length over the target's.
+    ``focal_ratio`` is the source's focal length over the target's: a smaller target is no distortion.
     """
-    scale = warped.shape[1] / REFERENCE_WIDTH_PX
-    if not is_valid(H_geometric, visible, focal_ratio):
+    uv = warp.uv[warp.coverage]
+    first, last = np.floor(uv.min(0)).astype(int), np.ceil(uv.max(0)).astype(int)
+    to_source, (w, h) = np.array([[1.0, 0.0, first[0]], [0.0, 1.0, first[1]], [0.0, 0.0, 1.0]]), last - first + 1
+
+    def is_valid(H: FloatArray) -> bool:
+        """Check the visible part of the source: its other corners may lie behind the target."""
+        return check_homography(np.diag([focal_ratio, focal_ratio, 1.0]) @ H @ to_source, (h, w))
+
+    if not is_valid(H_geometric):
         return unmatched(H_geometric, "H_geometric distorts this source's corners too much to match it")
-    region = overlap_region(*coverages, round(_OVERLAP_MARGIN_PX * scale))
-    if region is None:
+    both, scale = warp.coverage & reference.coverage, warp.coverage.shape[1] / REFERENCE_WIDTH_PX
+    if not both.any():
         return unmatched(H_geometric, "no overlap with the primary camera")
-    least = _MIN_OVERLAP_PX * scale
-    if min(region.x1 - region.x0, region.y1 - region.y0) < least:
+    crop, least = bounding_box(both, round(_OVERLAP_MARGIN_PX * scale)), _MIN_OVERLAP_PX * scale
+    if min(side.stop - side.start for side in crop) - 1 < least:
         return unmatched(H_geometric, f"the overlap with the primary camera is narrower than {least:.0f} px")
-    crop = slice(region.y0, region.y1 + 1), slice(region.x0, region.x1 + 1)
-    usable = (coverages[0] & coverages[1])[crop]
-    cropped = match_features(warped[crop], reference[crop], usable, config.ratio)
-    offset = np.array([region.x0, region.y0])
-    matches = Matches(cropped.warped + offset, cropped.reference + offset)
-    shown = overlap_region(coverages[0], coverages[0], 0)
-    assert shown is not None
-    return accept(H_geometric, matches, shown, visible, focal_ratio, scale, config)
+    offset = np.array([crop[1].start, crop[0].start])
+    matches = match_features(_grey(warp.image)[crop], _grey(reference.image)[crop], both[crop], config.ratio)
+    rows, columns = bounding_box(warp.coverage)
+    corners = [(x, y) for x in (columns.start, columns.stop - 1) for y in (rows.start, rows.stop - 1)]
+    matches = Matches(matches.warped + offset, matches.reference + offset)
+    return accept(H_geometric, matches, np.array(corners, np.float64), is_valid, scale, config)
 
 
 def accept(
     H_geometric: FloatArray,
     matches: Matches,
-    shown: Region,
-    visible: Region,
-    focal_ratio: float,
+    corners: FloatArray,
+    is_valid: Callable[[FloatArray], bool],
     scale: float,
     config: PaperConfig,
-) -> FeatureReport:
-    """Apply the paper's three criteria for reliable matches and choose the case of H_base.
+) -> BaseTransformation:
+    """Apply the paper's three criteria for reliable matches and choose α.
 
-    Arguments are as in ``optimise_transformation``; ``shown`` is the bounding box of the source's warp in target pixels
-    and ``scale`` the target's width over ``REFERENCE_WIDTH_PX``.
+    ``corners`` (4, 2) bound the source's warp, target pixels; ``is_valid`` checks a homography of its visible part;
+    ``scale`` is the target's width over ``REFERENCE_WIDTH_PX``.
     """
     count = len(matches.warped)
     if count < config.min_matches:
@@ -225,27 +176,29 @@ def accept(
     if estimate is None:
         return unmatched(H_geometric, f"{count} good matches determine no homography", matches)
     M, inlier = estimate
-    H_feature = M @ H_geometric
+    H_feature, inliers = M @ H_geometric, int(inlier.sum())
     agreeing = Matches(matches.warped[inlier], matches.reference[inlier])
-    inliers = int(inlier.sum())
-    if not is_valid(H_feature, visible, focal_ratio):
+    if not is_valid(H_feature):
         reason = f"H_feature from {inliers} of {count} matches distorts the corners too much"
-        return FeatureReport(normalised(H_geometric), "geometric", 1.0, count, inliers, None, reason, agreeing)
-    consistency_px = consistency(H_geometric, H_feature, shown.corners)
+        return unmatched(H_geometric, reason, agreeing)
+    consistency_px = consistency(H_geometric, H_feature, corners)
     consistent_px, inconsistent_px = config.consistent_px * scale, config.inconsistent_px * scale
     alpha = float(np.clip((consistency_px - consistent_px) / (inconsistent_px - consistent_px), 0.0, 1.0))
     evidence = f"{inliers} of {count} matches move the corners by {consistency_px:.1f} px"
-    case: Case
     if alpha == 0:
-        case, reason = "feature", f"consistent: {evidence}, at most {consistent_px:.1f}"
+        reason = f"consistent: {evidence}, at most {consistent_px:.1f}"
     elif alpha < 1:
-        case, reason = "blended", f"partially consistent: {evidence}, alpha {alpha:.2f}"
+        reason = f"partially consistent: {evidence}, alpha {alpha:.2f}"
     else:
-        case, reason = "geometric", f"inconsistent: {evidence}, not below {inconsistent_px:.1f}"
+        reason = f"inconsistent: {evidence}, not below {inconsistent_px:.1f}"
     base = alpha * normalised(H_geometric) + (1 - alpha) * normalised(H_feature)
-    return FeatureReport(base, case, alpha, count, inliers, consistency_px, reason, agreeing)
+    return BaseTransformation(base, alpha, (1 - alpha) * inliers / count, agreeing, reason)
 
 
-def unmatched(H_geometric: FloatArray, reason: str, matches: Matches = NO_MATCHES) -> FeatureReport:
-    """Report that H_geometric is kept, with the reason."""
-    return FeatureReport(normalised(H_geometric), "geometric", 1.0, len(matches.warped), 0, None, reason, matches)
+def unmatched(H_geometric: FloatArray, reason: str, matches: Matches = NO_MATCHES) -> BaseTransformation:
+    """Keep H_geometric, for a reason."""
+    return BaseTransformation(normalised(H_geometric), 1.0, 0.0, matches, reason)
+
+
+def _grey(image: Float32Image) -> GreyImage:
+    return np.clip(np.round(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), 0, 255).astype(np.uint8)

@@ -49,16 +49,6 @@ class SceneObject:
         return self.confidence * weight * self.density_factor
 
 
-@dataclass(frozen=True)
-class AlignmentReport:
-    """Result of stage 3 for one source."""
-
-    H_aligned: FloatArray  # (3, 3) T(β ΔT) · H_base
-    shift_px: FloatArray  # (2,) ΔT, zero where it was declined
-    objects: tuple[SceneObject, ...]  # the objects found
-    reason: str  # explanation of the shift
-
-
 # --- equations --------------------------------------------------------------------------------------------------------
 def mean_offset(c1: FloatArray, c2: FloatArray, weights: FloatArray, H_base: FloatArray) -> FloatArray:
     """ΔT = argmin Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖², which is the weighted mean of c2_j − H_base c1_j.
@@ -152,25 +142,20 @@ def find_objects(
 # --- the stage --------------------------------------------------------------------------------------------------------
 def align_objects(
     objects: Sequence[SceneObject], H_base: FloatArray, width_px: int, config: PaperConfig
-) -> AlignmentReport:
-    """Compute ΔT, decline it if too long for the target's width, and apply it to the (3, 3) H_base of stage 2."""
+) -> tuple[FloatArray, str]:
+    """H_aligned = T(β ΔT) · H_base (3, 3), or H_base if ΔT is too long for the target's width; and the reason."""
     if not objects:
-        return declined(H_base, "no cluster of matches: nothing to align")
+        return H_base, "no cluster of matches: nothing to align"
     weights = np.array([o.weight(config) for o in objects])
     if weights.sum() <= 0:
-        return declined(H_base, f"{len(objects)} clusters, none with a positive type weight", objects)
+        return H_base, f"{len(objects)} clusters, none with a positive type weight"
     c1, c2 = (np.stack([getattr(o, name) for o in objects]) for name in ("center_source", "center_target"))
     shift = mean_offset(c1, c2, weights, H_base)
     length, limit = float(np.linalg.norm(shift)), _MAX_SHIFT_PX * width_px / REFERENCE_WIDTH_PX
     if not length <= limit:
-        return declined(H_base, f"{len(objects)} objects ask for {length:.1f} px, more than {limit:.1f}", objects)
+        return H_base, f"{len(objects)} objects ask for {length:.1f} px, more than {limit:.1f}"
     kinds = ", ".join(sorted({o.type for o in objects}))
-    reason = f"{len(objects)} objects ({kinds}) shift it by {config.beta:g} x ({shift[0]:+.1f}, {shift[1]:+.1f}) px"
     T = np.eye(3)
     T[:2, 2] = config.beta * shift
-    return AlignmentReport(T @ H_base, shift, tuple(objects), reason)
-
-
-def declined(H_base: FloatArray, reason: str, objects: Sequence[SceneObject] = ()) -> AlignmentReport:
-    """Report that H_base is kept, with the reason."""
-    return AlignmentReport(H_base, np.zeros(2), tuple(objects), reason)
+    by = f"{config.beta:g} x ({shift[0]:+.1f}, {shift[1]:+.1f}) px"
+    return T @ H_base, f"{len(objects)} objects ({kinds}) shift it by {by}"

@@ -8,7 +8,7 @@ either frame. ``merging`` joins the frames' views of one hole.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -30,7 +30,7 @@ from arbiview_aug.sample.frame import Neighbour
 from arbiview_aug.sample.neighbours import BOX_MARGIN_M, ChangeRisk, Warn, change_risks, neighbour_images
 from arbiview_aug.scene.boxes import BoxSurface, whole
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Street, Surface
+from arbiview_aug.scene.surface import Street, Surface
 
 Reach = Literal["road", "all"]
 """Area that neighbours may fill: the near road, or everything that the surface covers."""
@@ -103,18 +103,17 @@ class Fills:
 
 # --- planning ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
-class _HoleSurface(DenseSurface):
+class _HoleSurface(Surface):
     """Known distances of the holes' pixels, hidden from a neighbour by labelled objects and measured points."""
 
     holes: Sequence[Hole]
     full: Surface  # the frame's surface
     objects: BoxSurface | None  # labelled objects of both frames
-    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
 
     @property
-    def is_dense(self) -> bool:  # type: ignore[override]
-        """Whether anything hides the holes' pixels."""
-        return self.objects is not None or self.full.background.is_dense
+    def is_guess(self) -> bool:  # type: ignore[override]
+        """Whether nothing hides the holes' pixels."""
+        return self.objects is None and self.full.background.is_guess
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
         """Inverse distances (h, w) of the hole with this camera's name; the camera may be a window of it."""
@@ -122,17 +121,14 @@ class _HoleSurface(DenseSurface):
         left, top = np.rint(hole.camera.K[:2, 2] - camera.K[:2, 2]).astype(int)
         return hole.inverse_distance[top : top + camera.height_px, left : left + camera.width_px]
 
-    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Labelled objects hide everything, measured points hide points behind them; cached by camera."""
-        key, full = camera.content_key, self.full.background
-        if key not in self._shadows:
-            before = np.zeros(camera.size, np.float32)
-            if isinstance(full, DenseSurface):
-                before = full.occlusion_map(camera, rays, memory).beyond.copy()
-            if self.objects is not None:
-                before[self.objects.occlusion_map(camera, rays, memory).solid >= 0] = np.inf
-            self._shadows[key] = OcclusionMap(before)
-        return self._shadows[key]
+    def hidden(
+        self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True
+    ) -> npt.NDArray[np.float32]:
+        """Labelled objects hide everything, measured points hide points behind them."""
+        before = self.full.background.hidden(camera, rays, memory, coarse=coarse)
+        if self.objects is not None:
+            before[self.objects.occlusion_map(camera, rays, memory).solid >= 0] = np.inf
+        return before
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Uncertainty of the full surface."""

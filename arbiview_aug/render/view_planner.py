@@ -126,7 +126,7 @@ class ViewPlanner:
                 # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
                 coarser = level if surface.is_layered else max(level, occlusion_level(source))
                 half = halved_camera(source, coarser) if coarser else source
-                hiding = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
+                hiding = self.scene.occlusion_map(surface, half, self.maps.rays(half), self.maps.memory)
             occlusions.append(hiding)
             scales.append(0.5 ** (coarser - level))
         faces = max((len(hiding.before_m) for hiding in occlusions), default=0)
@@ -391,7 +391,7 @@ def _at(rows: Any, k: npt.NDArray[np.int64]) -> Any:
 
 def _is_measured(surface: Any) -> bool:
     """Whether a surface includes the objects on the street."""
-    return bool(surface.is_layered or surface.is_dense)
+    return bool(surface.is_layered or not surface.is_guess)
 
 
 def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:

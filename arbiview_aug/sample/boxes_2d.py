@@ -15,7 +15,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.scene.boxes import checked_boxes, draw_boxes, is_over, meets, silhouette_sums
+from arbiview_aug.scene.boxes import checked_boxes, draw_boxes, is_over, meets
 
 _NEAR_M = 0.1  # near plane
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))  # [8, 3]
@@ -132,8 +132,8 @@ def _project(camera: Camera, boxes: FloatArray) -> ImageBoxes:
     uncut, inside = np.array(list(outlines.values())).reshape(-1, 2, 4).swapaxes(0, 1)
     uncut_px, inside_px = (np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1) for rectangles in (uncut, inside))
     boxes = boxes[rows]
-    silhouette_px = silhouette_sums(camera, boxes, np.ones(camera.size))
-    _, face = draw_boxes(camera, boxes)
+    silhouette_px = np.zeros(len(boxes), np.int64)
+    _, face = draw_boxes(camera, boxes, met=silhouette_px)
     shown = face >= 0 if camera.mask is None else (face >= 0) & camera.mask
     visible_px = np.bincount(face[shown], minlength=len(boxes))
     return ImageBoxes(rows, inside, 1 - inside_px / uncut_px, visible_px / np.maximum(silhouette_px, 1))

@@ -10,7 +10,7 @@ not read from that source; where no other source sees them, they are holes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -22,7 +22,6 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.image_ops import FRESH, Memory
-from arbiview_aug.scene.point_cloud import PointCloudSurface
 from arbiview_aug.scene.surface import Layer, OcclusionMap, Points, Surface
 
 PIECES = 2
@@ -186,6 +185,7 @@ PARTS, TOP_PART, RIM_PART = 7, 5, 6
 """Number of parts of an object; the part of its tops, and of the rim just below their edges, for samples of paint."""
 
 _WIDER = np.array([1, 1, 1, 1, 0, 1])  # all planes of a piece but its floor
+_UNCOUNTED = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +201,6 @@ class BoxSurface(Surface):
     boxes: FloatArray  # (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame
     solids: FloatArray  # (B, pieces, 6, 4) planes of their shapes
     displaced: Layer | None = None  # (B, 5, rows, columns) of their sides, as ``solids_among`` gives it
-    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, init=False, repr=False)
     is_layered: ClassVar[bool] = True
 
     @property
@@ -217,24 +216,21 @@ class BoxSurface(Surface):
         return q
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Occlusion by objects in a source; cached for the next target."""
-        key = camera.content_key
-        if key not in self._shadows:
-            pixel_rad = float(1 / camera.K[0, 0])
-            scale = 1 / (1 + 2 * pixel_rad)  # a lookup's error
-            onto = self._hidden(camera, rays, memory, coarse=True)
-            widened = self._widened(camera.center_m, pixel_rad, lift=0.5)
-            drawn = draw_solids(camera, *widened, rays, memory, scale=scale, faces=False, onto=onto)
-            before_m = self.before_faces(camera.center_m).astype(np.float32)
-            self._shadows[key] = OcclusionMap(*drawn, before_m)
-        return self._shadows[key]
+        """Occlusion by objects and points in a source."""
+        pixel_rad = float(1 / camera.K[0, 0])
+        widened = self._widened(camera.center_m, pixel_rad, lift=0.5)
+        scale = 1 / (1 + 2 * pixel_rad)  # a lookup's error
+        onto = self.street.hidden(camera, rays, memory)
+        drawn = draw_solids(camera, *widened, rays, memory, scale=scale, faces=False, onto=onto)
+        before_m = self.solids[..., :3] @ camera.center_m - self.solids[..., 3]
+        return OcclusionMap(*drawn, before_m.reshape(-1).astype(np.float32))
 
     def drawn(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> tuple[Layer, npt.NDArray[np.int32]]:
         """Inverse distances (h, w) of the objects' faces along a camera's rays where nothing hides them; faces, or -1.
 
         A face's number is 6 x its piece + its plane; ``face_parts`` gives its part.
         """
-        onto = self._hidden(camera, rays, memory, coarse=False)
+        onto = self.street.hidden(camera, rays, memory, coarse=False)
         widened = self._widened(camera.center_m, float(1 / camera.K[0, 0]))
         q, face = draw_solids(camera, *widened, rays, memory, onto=onto)
         if self.displaced is not None:
@@ -243,16 +239,6 @@ class BoxSurface(Surface):
             pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
             displace(rays.planes, rays.parameters, *pose, self.boxes, self.solids, self.displaced, face, q)
         return q, face
-
-    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
-        """Inverse distances (h, w) beyond which measured points hide, 0 where none do."""
-        if isinstance(self.street, PointCloudSurface):
-            return self.street.hidden(camera, rays, memory, coarse=coarse)
-        return memory.full(camera.size, 0, np.float32)
-
-    def before_faces(self, origin: FloatArray) -> FloatArray:
-        """Distances (n,) of a point in front of the planes of all faces, metres."""
-        return np.asarray((self.solids[..., :3] @ origin - self.solids[..., 3]).reshape(-1))
 
     @cached_property
     def face_parts(self) -> npt.NDArray[np.int32]:
@@ -279,21 +265,7 @@ class BoxSurface(Surface):
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) in 1/m of the street because of unlabelled objects; faces have ``BOX_ERROR``."""
         error = self.street.uncertainty(origin, directions, inverse_distance)
-        return error if self.street.is_dense else UNLABELLED * error
-
-
-def _solid_rows(
-    camera: Camera, boxes: FloatArray, planes: FloatArray, rays: PixelRays
-) -> tuple[Layer, npt.NDArray[np.int64]]:
-    """Pieces (B, pieces, 6, 4) that a camera may see as ``kernels.draw_solids`` reads them, and their numbers (n,)."""
-    from arbiview_aug.scene.kernels import ROW, solid_rows
-
-    most = planes.shape[0] * planes.shape[1] + 1
-    rows, numbers = np.empty((most, ROW), np.float32), np.empty(most, np.int64)
-    pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
-    boxes, planes = np.ascontiguousarray(boxes), np.ascontiguousarray(planes)
-    count = solid_rows(boxes, planes, pose[1], pose[0], rays.cone, rows, numbers)
-    return rows[:count], numbers[:count]
+        return UNLABELLED * error if self.street.is_guess else error
 
 
 def draw_solids(
@@ -306,38 +278,38 @@ def draw_solids(
     scale: float = 1.0,
     faces: bool = True,
     onto: Layer | None = None,
+    met: npt.NDArray[np.int64] = _UNCOUNTED,
 ) -> tuple[Layer, npt.NDArray[np.int32]]:
     """Rasterise the pieces (B, pieces, 6, 4) of ``solids`` in boxes (B, 7).
 
     ``rays`` are the camera's, if known; ``scale`` is a factor of inverse distances. With ``faces`` the faces are
     numbered, 6 x piece + plane, else the pieces. Nearer pieces overwrite ``onto`` (h, w), inverse distances, 0 by
-    default.
+    default. ``met`` (B x pieces,) counts the pixels whose rays meet a piece, occluded or not.
 
     Returns:
         (h, w) inverse distances of the nearest faces, or of ``onto``; (h, w) the pieces or faces, or -1.
     """
-    from arbiview_aug.scene.kernels import draw_solids as draw
+    from arbiview_aug.scene import kernels
 
-    rays = rays or pixel_rays(camera)
+    rays, most = rays or pixel_rays(camera), planes.shape[0] * planes.shape[1] + 1
     q = memory.full(camera.size, 0, np.float32) if onto is None else onto
-    number, rows = memory.full(camera.size, -1, np.int32), _solid_rows(camera, boxes, planes, rays)
-    draw(rays.planes, rays.parameters, *rows, rays.cones, CELL_PX, scale, faces, q, number)
+    number, numbers = memory.full(camera.size, -1, np.int32), np.empty(most, np.int64)
+    boxes, planes = np.ascontiguousarray(boxes), np.ascontiguousarray(planes)
+    R, center, rows = camera.cam2ego[:3, :3].copy(), camera.center_m.copy(), np.empty((most, kernels.ROW), np.float32)
+    seen = slice(kernels.solid_rows(boxes, planes, center, R, rays.cone, rows, numbers))
+    pieces = rows[seen], numbers[seen], rays.cones, CELL_PX
+    kernels.draw_solids(rays.planes, rays.parameters, *pieces, scale, faces, q, number, met)
     return q, number
 
 
-def draw_boxes(camera: Camera, boxes: FloatArray) -> tuple[Layer, npt.NDArray[np.int32]]:
-    """Rasterise whole boxes (B, 7): inverse distances (h, w) of the nearest, 0 for none; (h, w) its row, or -1."""
-    return draw_solids(camera, boxes, whole(boxes), faces=False)
+def draw_boxes(
+    camera: Camera, boxes: FloatArray, met: npt.NDArray[np.int64] = _UNCOUNTED
+) -> tuple[Layer, npt.NDArray[np.int32]]:
+    """Rasterise whole boxes (B, 7): inverse distances (h, w) of the nearest, 0 for none; (h, w) its row, or -1.
 
-
-def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> FloatArray:
-    """Sums (B,) of weights (h, w) over the pixels whose rays meet each box, occluded or not."""
-    from arbiview_aug.scene.kernels import sum_silhouettes
-
-    rays, sums = pixel_rays(camera), np.zeros(len(boxes))
-    rows = _solid_rows(camera, boxes, whole(boxes), rays)
-    sum_silhouettes(rays.planes, rays.parameters, *rows, rays.cones, CELL_PX, weight, sums)
-    return sums
+    ``met`` (B,) counts the pixels whose rays meet a box, occluded or not.
+    """
+    return draw_solids(camera, boxes, whole(boxes), faces=False, met=met)
 
 
 def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolArray:

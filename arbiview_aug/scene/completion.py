@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.environment import borrowing, called, compiled, inlined
+from arbiview_aug.environment import borrowing, called, compiled
 from arbiview_aug.scene.kernels import upsampled_row
-from arbiview_aug.scene.panorama_kernels import cells_row
+from arbiview_aug.scene.panorama_kernels import cells_row, hidden_below
 
 _STEP = np.float32(0.1)
 """Relative change of inverse distance within ``SMOOTH_RAD`` above which a step is an outline."""
@@ -190,13 +190,6 @@ def _drop_hidden(scratch: Any, away: int, side: int, points: int, mapped: int, b
             cells[n] = y * w + x
             n += 1
     return n
-
-
-@inlined
-def hidden_below(known: Any) -> Any:
-    """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
-    known = max(known, _ZERO)
-    return known / (np.float32(1.1) + np.float32(0.3) * known)
 
 
 # --- made dense -------------------------------------------------------------------------------------------------------

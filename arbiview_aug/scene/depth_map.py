@@ -119,7 +119,7 @@ def anchored(depth_map: DepthMap, points: Points, others: Sequence[DepthMap] = (
     The log-ratio of the map's depth to the points' is averaged around each pixel, on cells as wide as the Gaussian's
     sigma. A pixel becomes unknown where the map contradicts most of the points around it.
     """
-    from arbiview_aug.scene.map_kernels import compare_maps, compare_points
+    from arbiview_aug.scene.panorama_kernels import compare_maps, compare_points
 
     camera, depth_m = depth_map
     h, w = depth_m.shape
@@ -178,7 +178,7 @@ def points_of(maps: Sequence[DepthMap], before: Points | None = None) -> tuple[L
 
     Pixels within ``OWN_CAR_M`` become unknown.
     """
-    from arbiview_aug.scene.map_kernels import put_points
+    from arbiview_aug.scene.panorama_kernels import put_points
 
     lead, most, first, car = 0 if before is None else len(before), sum(part.depth_m.size for part in maps), 0, OWN_CAR_M
     points, pixels, count = np.empty((lead + most + 1, 3), np.float32), np.empty(most + 1, np.int32), 0
@@ -205,7 +205,7 @@ def hidden_by(maps: Sequence[DepthMap], camera: Camera) -> Layer | None:
 
     None without known pixels.
     """
-    from arbiview_aug.scene.map_kernels import hidden_distances
+    from arbiview_aug.scene.panorama_kernels import hidden_distances
 
     layers = []
     for depth_map in maps:

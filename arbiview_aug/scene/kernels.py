@@ -114,20 +114,23 @@ def solid_rows(boxes: Any, planes: Any, center: Any, R: Any, axis: Any, rows: An
 
 @compiled
 def draw_solids(
-    planes: Any, P: Any, rows: Any, numbers: Any, cones: Any, step: int, scale: float, faces: bool, q: Any, number: Any
-) -> None:
+    planes: Any, P: Any, rows: Any, numbers: Any, cones: Any, step: int, scale: float, faces: bool, q: Any, number: Any,
+    met: Any,
+) -> None:  # fmt: skip
     """Rasterise pieces into a z-buffer ``q`` (h, w) and their ``number`` (h, w) int32, run of cells by run of cells.
 
     Each of ``rows`` (n, ROW) float32 has six planes, those that the camera lies before first, each as the inverse
     distance along rays x, y, z and its slope (24); how many are before; the direction of its box's middle (3) and the
     cosine of its cone; the planes' numbers (6). ``numbers`` (n,) are the pieces among all. Rays are those of
     ``static_image``, in ``cell_cones`` of cells ``step`` pixels wide. ``scale`` is a factor of inverse distances. With
-    ``faces`` the numbers are 6 x piece + plane, else the pieces.
+    ``faces`` the numbers are 6 x piece + plane, else the pieces. ``met`` (all pieces,) counts the pixels whose rays
+    meet a piece, occluded or not; (0,) counts none.
     """
-    h, w = q.shape
-    nx = cones.shape[2]
-    work, near_box, heights = np.empty((7, w), np.float32), np.empty(nx, np.bool_), _heights(cones)
+    (h, w), (_, ny, nx) = q.shape, cones.shape
+    work, near_box, heights = np.empty((7, w), np.float32), np.empty(nx, np.bool_), np.empty((2, ny), np.float32)
     kept, factor = np.empty((2, w), np.int32), np.float32(scale)
+    for j in range(ny):
+        heights[0, j], heights[1, j] = (cones[1, j] - cones[3, j]).min(), (cones[1, j] + cones[3, j]).max()
     for k in range(rows.shape[0]):
         b, me = rows[k], np.int32(numbers[k])
         first, last = _rows_of_piece(b, heights)
@@ -143,6 +146,8 @@ def draw_solids(
                 near, which = q[y, x0 : x0 + n], number[y, x0 : x0 + n]
                 for x in range(n):  # the first distance below 1 cm counts as 1 cm
                     value[x] = min(enter[x], _MOST) * factor if enter[x] > leave[x] else _ZERO
+                for x in range(n if met.shape[0] else 0):
+                    met[me] += enter[x] > leave[x]
                 for x in range(n):
                     entered[x] = me
                 for k in range(int(b[24]) if faces else 0):
@@ -161,45 +166,12 @@ def draw_solids(
                     near[x] = scratch[x]
 
 
-@compiled
-def sum_silhouettes(
-    planes: Any, P: Any, rows: Any, numbers: Any, cones: Any, step: int, weight: Any, sums: Any
-) -> None:
-    """Add weights (h, w) of the pixels whose rays meet a piece to its sum, occluded or not.
-
-    ``sums`` (all pieces,) float64 is updated; the other arguments are as in ``draw_solids``.
-    """
-    h, w = weight.shape
-    nx = cones.shape[2]
-    work, near_box, heights = np.empty((6, w), np.float32), np.empty(nx, np.bool_), _heights(cones)
-    for k in range(rows.shape[0]):
-        b = rows[k]
-        first, last = _rows_of_piece(b, heights)
-        for j in range(first, last):
-            x0, n = columns_of_piece(b, cones[:, j], near_box, step, w)
-            if n == 0:
-                continue
-            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
-            for y in range(j * step, min(j * step + step, h)):
-                rays_row(planes, P, y, x0, rx, ry, rz)
-                through_row(b, rx, ry, rz, enter, leave, work[5, :n])
-                for x in range(n):
-                    if enter[x] > leave[x]:
-                        sums[numbers[k]] += weight[y, x0 + x]
-
-
-@inlined
-def _heights(cones: Any) -> Any:
-    """Least and largest vertical component (2, ny) of the rays in each row of cells."""
-    heights = np.empty((2, cones.shape[1]), np.float32)
-    for j in range(cones.shape[1]):
-        heights[0, j], heights[1, j] = (cones[1, j] - cones[3, j]).min(), (cones[1, j] + cones[3, j]).max()
-    return heights
-
-
 @inlined
 def _rows_of_piece(b: Any, heights: Any) -> tuple[int, int]:
-    """First and last (exclusive) row of cells whose ``_heights`` may meet the cone around a piece's box."""
+    """First and last (exclusive) row of cells whose rays may meet the cone around a piece's box.
+
+    ``heights`` (2, ny) are the least and largest vertical components of the rays in each row.
+    """
     height, cosine = b[26], b[28]
     aside = np.sqrt(max(_ONE - height * height, _ZERO) * max(_ONE - cosine * cosine, _ZERO))
     low = height * cosine - aside if -height < cosine else -_ONE  # else it holds the direction straight down
@@ -341,14 +313,3 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
                 pairs[0, n], pairs[1, n] = k, i
                 n += 1
     return pairs[:, :n]
-
-
-@compiled
-def close_gaps(points: Any, left_out: Any) -> int:
-    """Move the points (P, 3) up over those that are ``left_out`` (P,); return how many stay."""
-    n = 0
-    for i in range(points.shape[0]):
-        if not left_out[i]:
-            points[n, 0], points[n, 1], points[n, 2] = points[i, 0], points[i, 1], points[i, 2]
-            n += 1
-    return n

@@ -27,7 +27,7 @@ from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.depth_map import CELL_RAD, OWN_CAR_M, SHRINK_RAD, SUPPORT_RAD, DepthMap, hidden_by
-from arbiview_aug.scene.surface import DenseSurface, Layer, OcclusionMap, Points, StaticSurface
+from arbiview_aug.scene.surface import Layer, Points, StaticSurface, Surface
 
 SEE_THROUGH_RAD = math.radians(2.0)
 """Angle within which nearer points on both sides of a point occlude it: 1.5 spacings of 32 scan lines."""
@@ -199,7 +199,7 @@ degrees."""
 
 
 @dataclass(frozen=True, eq=False)
-class PointCloudSurface(DenseSurface):
+class PointCloudSurface(Surface):
     """Points made dense over the street."""
 
     street: StaticSurface  # where nothing was measured
@@ -207,9 +207,7 @@ class PointCloudSurface(DenseSurface):
     mapped: int = 0  # number of trailing points from depth maps
     swept: bool = False  # whether points of neighbouring frames are among them
     maps: Sequence[DepthMap] = ()  # these depth maps, for occlusion in their cameras
-    _elevations: dict[bytes, tuple[float, float]] = field(default_factory=dict, repr=False)
     _panoramas: dict[bytes, dict[Window, Panorama]] = field(default_factory=dict, repr=False)
-    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
     _nodes: dict[tuple[bytes, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -241,21 +239,12 @@ class PointCloudSurface(DenseSurface):
         add_residuals(*nodes, panorama.layers, q)
         return q
 
-    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Occlusion in a source; cached for the next target.
-
-        Points are hidden if they are farther than the measured surface by a tenth of their distance and 0.3 m, as in
-        evaluation. Nothing hides where nothing was measured.
-        """
-        key = camera.content_key
-        if key not in self._shadows:
-            self._shadows[key] = OcclusionMap(self.hidden(camera, rays, memory))
-        return self._shadows[key]
-
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
 
-        With ``coarse`` a camera's depth map decides, if it has one, and measured points where it has too few pixels.
+        Hidden is what is farther than the measured surface by a tenth of its distance and 0.3 m, as in evaluation, and
+        nothing where nothing was measured. With ``coarse`` a camera's depth map decides, if it has one, and measured
+        points where it has too few pixels.
         """
         from arbiview_aug.scene.panorama_kernels import interpolate_layer
 
@@ -295,9 +284,8 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.completion import elevations
 
         key, origin = origin.tobytes(), origin.copy()  # a copy has one layout: kernels are compiled for each
-        if key not in self._elevations:
-            self._elevations[key] = (-math.pi, math.pi) if self.mapped else elevations(self._rows, origin)
-        (low, high), filters = self._elevations[key], math.ceil(cells.reach) + 4 * cells.smooth + 1
+        low, high = (-math.pi, math.pi) if self.mapped else elevations(self._rows, origin)
+        filters = math.ceil(cells.reach) + 4 * cells.smooth + 1
         beyond = (filters - cells.halo) * cells.rad  # from all points: there even the halo is static
         window, is_smooth = Window.around(rays, R, cells, low - beyond, high + beyond)
         known = self._panoramas.setdefault(key, {})

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 
 import numpy as np
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rays import PixelRays
 from arbiview_aug.choices import GeometryName
+from arbiview_aug.image_ops import Memory
 from arbiview_aug.scene.boxes import BoxSurface, solids, solids_among
 from arbiview_aug.scene.depth_map import Maps, forget, joined, points_of
 from arbiview_aug.scene.point_cloud import PointCloudSurface, own_car
-from arbiview_aug.scene.surface import CorrectedSurface, Correction, Far, Ground, Points, StaticSurface, Street, Surface
+from arbiview_aug.scene.surface import (
+    CorrectedSurface,
+    Correction,
+    Far,
+    Ground,
+    OcclusionMap,
+    Points,
+    StaticSurface,
+    Street,
+    Surface,
+)
 
 Geometry = Points | Maps
 
@@ -33,19 +46,23 @@ class Scene:
     corrections: tuple[Correction, ...] = ()  # of the street's distances by depth from overlap
     known: Surface | None = None  # surface whose distances are known, in place of all others but ``far``
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
+    _occlusion_maps: dict[tuple[Surface, bytes], OcclusionMap] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def parts(self) -> dict[str, Geometry | None]:
+        """Arrays and depth maps by the names in ``GeometryRow.reads``."""
+        return {"boxes": self.boxes, "points": self.points, "motion": self.motion, **self.further}
 
     def geometry(self, name: str) -> Geometry | None:
-        """The arrays or depth maps of a name in ``GeometryRow.reads``; None if there is none."""
-        substitute = {"points": "depth_m", "motion": "learned_depth_m"}.get(name)
-        if substitute is not None and getattr(self, name) is None:
-            return self.further.get(substitute)
-        return getattr(self, name) if name in ("boxes", "points", "motion") else self.further.get(name)
+        """The part of a name, or depth maps in place of missing points or motion; None if there is none."""
+        substitute = {"points": "depth_m", "motion": "learned_depth_m"}.get(name, name)
+        part = self.parts.get(name)
+        return self.further.get(substitute) if part is None else part
 
     @property
     def is_empty(self) -> bool:
         """Whether there is no geometry."""
-        arrays = self.boxes, self.points, self.motion
-        return all(array is None for array in arrays) and not self.further and not self.corrections
+        return all(part is None for part in self.parts.values()) and not self.corrections
 
     @cached_property
     def best(self) -> GeometryName:
@@ -61,13 +78,18 @@ class Scene:
             return self.known
         key = name, ground_z_m
         if key not in self._surfaces:
-            row = GEOMETRIES.get(name)
-            if row is None:
-                raise ValueError(f"geometry: expected one of {', '.join(GEOMETRIES)}, got {name!r}")
+            row = GEOMETRIES[name]
             if row.needs is not None and self.geometry(row.needs) is None:
                 raise ValueError(f"geometry={name!r}: expected a scene with {row.needs!r}, got one without")
             self._surfaces[key] = row.make(self, ground_z_m)
         return self._surfaces[key]
+
+    def occlusion_map(self, surface: Surface, camera: Camera, rays: PixelRays, memory: Memory) -> OcclusionMap:
+        """Occlusion by one of the scene's surfaces in a source; cached for the next target."""
+        key = surface, camera.content_key
+        if key not in self._occlusion_maps:
+            self._occlusion_maps[key] = surface.occlusion_map(camera, rays, memory)
+        return self._occlusion_maps[key]
 
 
 @dataclass(frozen=True)
@@ -96,31 +118,33 @@ def _boxes(scene: Scene, ground_z_m: float) -> Surface:
     return BoxSurface(_street(scene, ground_z_m), scene.boxes, solids(scene.boxes))
 
 
-def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: Geometry | None) -> Surface:
-    """Points of this frame and its neighbours, and depth maps, with the scene's boxes."""
-    from arbiview_aug.scene.kernels import close_gaps
+def _measured(*reads: str, needs: str) -> GeometryRow:
+    """The row of a surface of boxes among points and depth maps."""
+    return GeometryRow(lambda scene, ground_z_m: _point_cloud(scene, ground_z_m, reads), ("boxes", *reads), needs)
 
+
+def _point_cloud(scene: Scene, ground_z_m: float, reads: Sequence[str]) -> Surface:
+    """Points of this frame and its neighbours, and depth maps, with the scene's boxes."""
+    has_points = "points" in reads and scene.points is not None
+    parts = (scene.points, scene.sweeps, scene.sky) if has_points else (None, None, None)
+    clouds = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in parts]
+    points, pixels = np.concatenate(clouds, dtype=np.float32), np.zeros(0, np.int32)
+    points = points.compress(~own_car(points), axis=0)
+    maps = joined(chain.from_iterable(part for name in reads if isinstance(part := scene.parts.get(name), tuple)))
+    if maps:
+        points, pixels = points_of(maps, points)
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
-    further = (None, None) if points is None else (scene.sweeps, scene.sky)
-    parts = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in (points, *further)]
-    together = np.concatenate(parts, dtype=np.float32)
-    together = together[: close_gaps(together, np.concatenate([own_car(part) for part in parts]))]
-    known, pixels = [], np.zeros(0, np.int32)
-    if depth_maps := [part for part in maps if isinstance(part, tuple) and part]:
-        known = joined(chain.from_iterable(depth_maps))
-        together, pixels = points_of(known, together)
-    street = _street(scene, ground_z_m)
-    if len(together) == 0:
+    if len(points) == 0:
         return scene.surface("street" if boxes is None else "boxes", ground_z_m)
-    swept = len(parts[1]) > 0
+    street, swept = _street(scene, ground_z_m), len(clouds[1]) > 0
     if boxes is None:
-        return PointCloudSurface(street, together, len(pixels), swept, known)
-    planes, is_own, displaced = solids_among(boxes, together, ground_z_m)
-    is_own_pixel = is_own[len(together) - len(pixels) :]
-    if known:
-        forget(known, pixels[is_own_pixel])
-    others = together[: close_gaps(together, is_own)], int(np.count_nonzero(~is_own_pixel))
-    return BoxSurface(PointCloudSurface(street, *others, swept, known), boxes, planes, displaced)
+        return PointCloudSurface(street, points, len(pixels), swept, maps)
+    planes, is_own, displaced = solids_among(boxes, points, ground_z_m)
+    is_own_pixel = is_own[len(points) - len(pixels) :]
+    forget(maps, pixels[is_own_pixel])
+    mapped = int(np.count_nonzero(~is_own_pixel))
+    others = PointCloudSurface(street, points.compress(~is_own, axis=0), mapped, swept, maps)
+    return BoxSurface(others, boxes, planes, displaced)
 
 
 GEOMETRIES: dict[str, GeometryRow] = {
@@ -131,25 +155,9 @@ GEOMETRIES: dict[str, GeometryRow] = {
     "ground": GeometryRow(lambda scene, z_m: Ground(ground_z_m=z_m)),
     "street": GeometryRow(_street, overlap_depth=True),
     "boxes": GeometryRow(_boxes, ("boxes",), "boxes", overlap_depth=True),
-    "lidar": GeometryRow(
-        lambda scene, z_m: _point_cloud(scene, z_m, scene.points, scene.further.get("depth_m")),
-        ("boxes", "points", "depth_m"),
-        "points",
-    ),
-    "motion": GeometryRow(
-        lambda scene, z_m: _point_cloud(scene, z_m, None, scene.motion), ("boxes", "motion"), "motion"
-    ),
-    "fused": GeometryRow(
-        lambda scene, z_m: _point_cloud(
-            scene, z_m, scene.points, *map(scene.further.get, ("depth_m", "learned_depth_m")), scene.motion
-        ),
-        ("boxes", "points", "depth_m", "motion", "learned_depth_m"),
-        "motion",
-    ),
-    "learned": GeometryRow(
-        lambda scene, z_m: _point_cloud(scene, z_m, None, scene.further["learned_depth_m"]),
-        ("boxes", "learned_depth_m"),
-        "learned_depth_m",
-    ),
+    "lidar": _measured("points", "depth_m", needs="points"),
+    "motion": _measured("motion", needs="motion"),
+    "fused": _measured("points", "depth_m", "motion", "learned_depth_m", needs="motion"),
+    "learned": _measured("learned_depth_m", needs="learned_depth_m"),
 }
 """All surfaces by name. A new one is a class in this folder and a row here."""

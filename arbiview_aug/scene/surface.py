@@ -37,12 +37,10 @@ class Surface(ABC):
 
     Attributes:
         is_layered: Objects are rasterised in front of ``background``, see ``scene.boxes.BoxSurface``.
-        is_dense: Points or depth maps, see ``DenseSurface``.
-        is_guess: Not measured; occluders also hide its points that lie in front of them.
+        is_guess: Not measured, so that it hides nothing; occluders also hide its points that lie in front of them.
     """
 
     is_layered: ClassVar[bool] = False
-    is_dense: ClassVar[bool] = False
     is_guess: ClassVar[bool] = False
 
     @property
@@ -53,6 +51,15 @@ class Surface(ABC):
     @abstractmethod
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """Inverse distances (h, w) along a camera's pixel rays, 1/m, at most ``MAX_INVERSE_DISTANCE``."""
+
+    def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:
+        """Inverse distances (h, w) beyond which it hides points, 1/m, 0 by default; ``coarse`` ones cost less."""
+        layer: Layer = memory.full(camera.size, 0, np.float32)
+        return layer
+
+    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
+        """Occlusion by the surface in a source image."""
+        return OcclusionMap(self.hidden(camera, rays, memory))
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) of ``inverse_distance`` in 1/m; by default that of a typical object at 20 m."""
@@ -68,16 +75,6 @@ class OcclusionMap(NamedTuple):
     solid: npt.NDArray[np.int32] = np.zeros((0, 0), np.int32)  # (h, w) of occluders, -1: none; (0, 0) without objects
     # (F,) metres by which the camera lies before the planes of all faces; (0,) without objects
     before_m: Layer = np.zeros(0, np.float32)
-
-
-class DenseSurface(Surface):
-    """A surface with discontinuities, evaluated at every pixel."""
-
-    is_dense: ClassVar[bool] = True
-
-    @abstractmethod
-    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Occlusion by the surface in a source image."""
 
 
 class StaticSurface(Surface):
@@ -223,8 +220,7 @@ def wall_inverse_distance(
 
 def is_within_wall(origin: FloatArray) -> bool:
     """Whether a centre (3,) is inside the street's far wall; seen from outside, the wall has edges."""
-    ox = (origin[0] - WALL_CENTER_M[0]) / Street.half_length_m
-    oy = (origin[1] - WALL_CENTER_M[1]) / Street.half_width_m
+    ox, oy = (origin[:2] - WALL_CENTER_M) / (Street.half_length_m, Street.half_width_m)
     return bool(ox * ox + oy * oy < 1)
 
 

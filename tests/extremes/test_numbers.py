@@ -34,7 +34,7 @@ def test_the_published_stages_at_the_edges(name: str) -> None:
         with no_numpy_warnings():
             view = render_paper(source, Rig([target]), list(images)).targets[0]
         assert view.image.isfinite().all() and view.image.min() >= 0 and view.image.max() <= 1
-        assert all(np.isfinite(report.H_final).all() and report.features.reason for report in view.reports)
+        assert all(np.isfinite(report.H_final).all() and report.reason for report in view.reports)
 
 
 # --- gains ------------------------------------------------------------------------------------------------------------

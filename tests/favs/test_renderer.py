@@ -1,5 +1,6 @@
 """``quality="paper"``: the published stages together, alone and in ``RigRetarget``."""
 
+import re
 from dataclasses import fields, replace
 from functools import partial
 
@@ -57,7 +58,7 @@ def test_a_far_scene_is_rendered_as_it_is(pair_images) -> None:
     assert error.square().mean() < 2.0
     assert [r.primary for r in view.reports].count(True) == 1
     (matched,) = (r for r in view.reports if not r.primary)
-    assert matched.features.case == "feature" and matched.features.consistency_px < 1
+    assert re.match(r"features: consistent: .* matches move the corners by 0\.\d px", matched.reason)
 
 
 def test_a_wrong_calibration_is_corrected(pair_images) -> None:
@@ -104,8 +105,7 @@ def test_stage_switches(pair_images) -> None:
     for name, view in views.items():
         assert not torch.equal(view.image, plain.image), name
     (report,) = (r for r in views["object_alignment"].reports if not r.primary)
-    assert report.features.reason == "feature matching is switched off" and report.features.case == "geometric"
-    assert report.objects.objects and report.objects.shift_px.any()
+    assert re.match(r"features: feature matching is switched off; objects: \d+ objects .* shift it by", report.reason)
 
 
 def test_the_primary_camera() -> None:

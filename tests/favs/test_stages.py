@@ -11,7 +11,7 @@ import pytest
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.stage1_geometry import check_homography, h_geom
-from arbiview_aug.favs.stage2_features import NO_MATCHES, Matches, Region, accept, consistency, optimise_transformation
+from arbiview_aug.favs.stage2_features import NO_MATCHES, Matches, accept, consistency, optimise_transformation
 from arbiview_aug.favs.stage3_objects import (
     align_objects,
     clusters,
@@ -21,7 +21,7 @@ from arbiview_aug.favs.stage3_objects import (
     geometric_type,
     mean_offset,
 )
-from arbiview_aug.favs.stage4_fusion import fuse, fusion_weight
+from arbiview_aug.favs.stage4_fusion import Warp, fuse, fusion_weight
 from tests import helpers
 
 # --- stage 1: homographies of the calibration -------------------------------------------------------------------------
@@ -44,8 +44,9 @@ def test_check_homography() -> None:
 
 # --- stage 2: matches -------------------------------------------------------------------------------------------------
 SIZE = (300, 800)  # at the width at which PaperConfig states its lengths
-EVERYWHERE = Region(0, 0, 799, 299)
+CORNERS = np.array([(0.0, 0.0), (799, 0), (799, 299), (0, 299)])
 FULL = np.ones(SIZE, bool)
+PIXELS = np.stack(np.meshgrid(np.arange(800), np.arange(300)), -1).astype(np.float32)
 
 
 def texture(seed: int = 0, size: tuple[int, int] = SIZE) -> np.ndarray:
@@ -66,11 +67,11 @@ def grid_matches(M: np.ndarray, count: int = 5) -> Matches:
 
 
 def decide(matches: Matches, config: PaperConfig | None = None):
-    return accept(np.eye(3), matches, EVERYWHERE, EVERYWHERE, 1.0, 1.0, config or PaperConfig())
+    return accept(np.eye(3), matches, CORNERS, lambda H: check_homography(H, SIZE), 1.0, config or PaperConfig())
 
 
 def test_consistency_is_corner_motion_in_pixels() -> None:
-    corners = EVERYWHERE.corners
+    corners = CORNERS
     assert consistency(np.eye(3), translation(3, -4), corners) == pytest.approx(5)
     # A third coordinate of 1 + 1e-4 x: 1e-4 in an entry, but the corner (799, 299) shrinks towards the first by 7.4 %.
     M = np.eye(3)
@@ -88,44 +89,39 @@ def test_collinear_and_identical_points_give_no_usable_homography() -> None:
     same = np.full((20, 2), 7.0)
     for points in (line, same):
         report = decide(Matches(points, points + 1))
-        assert report.case == "geometric" and report.reason
+        assert report.alpha == 1 and report.reason
         assert np.array_equal(report.H_base, np.eye(3))
 
 
-def run(warped: np.ndarray, reference: np.ndarray, coverage: np.ndarray = FULL, config: PaperConfig | None = None):
-    return optimise_transformation(
-        np.eye(3), warped, reference, (coverage, FULL), EVERYWHERE, 1.0, config or PaperConfig()
-    )
+def warp_of(grey: np.ndarray, coverage: np.ndarray = FULL) -> Warp:
+    return Warp(np.dstack([grey] * 3).astype(np.float32), coverage, coverage, PIXELS)
 
 
 def test_no_or_narrow_overlap_declines_with_a_reason() -> None:
-    image = texture()
-    nothing, sliver = np.zeros((2, *SIZE), bool)
+    image, sliver = texture(), np.zeros(SIZE, bool)
     sliver[:, 795:] = True
-    nothing_shared = optimise_transformation(
-        np.eye(3), image, image, (sliver, ~sliver & (np.arange(800) < 700)), EVERYWHERE, 1.0, PaperConfig()
-    )
-    assert nothing_shared.reason == "no overlap with the primary camera"
-    assert "narrower than 16 px" in run(image, image, sliver).reason
-    assert not nothing.any()
+    run = partial(optimise_transformation, np.eye(3), warp_of(image, sliver), focal_ratio=1.0, config=PaperConfig())
+    without = warp_of(image, ~sliver & (np.arange(800) < 700))
+    assert run(reference=without).reason == "no overlap with the primary camera"
+    assert "narrower than 16 px" in run(reference=warp_of(image)).reason
 
 
 @pytest.mark.parametrize(
-    ("matches", "case", "alpha", "shift", "reason"),
+    ("matches", "alpha", "shift", "reason"),
     [
-        (grid_matches(translation(3, 2)), "feature", 0.0, (3, 2), "25 of 25 matches move the corners by 3.6 px"),
-        (grid_matches(translation(15, 0)), "blended", 0.5, (7.5, 0), "partially consistent"),
-        (grid_matches(translation(25, 0)), "geometric", 1.0, (0, 0), "inconsistent: 25 of 25 .* 25.0 px, not below 24"),
-        (grid_matches(np.diag([0.2, 0.2, 1.0])), "geometric", 1.0, (0, 0), "distorts the corners"),
-        (Matches(*(p[:9] for p in grid_matches(translation(3, 2)))), "geometric", 1.0, (0, 0), "9 good matches, fewer"),
+        (grid_matches(translation(3, 2)), 0.0, (3, 2), "25 of 25 matches move the corners by 3.6 px"),
+        (grid_matches(translation(15, 0)), 0.5, (7.5, 0), "partially consistent"),
+        (grid_matches(translation(25, 0)), 1.0, (0, 0), "inconsistent: 25 of 25 .* 25.0 px, not below 24"),
+        (grid_matches(np.diag([0.2, 0.2, 1.0])), 1.0, (0, 0), "distorts the corners"),
+        (Matches(*(p[:9] for p in grid_matches(translation(3, 2)))), 1.0, (0, 0), "9 good matches, fewer"),
     ],
 )
-def test_the_criteria_decide_the_case(matches: Matches, case: str, alpha: float, shift: tuple, reason: str) -> None:
+def test_the_criteria_decide_the_case(matches: Matches, alpha: float, shift: tuple, reason: str) -> None:
     """Enough matches, corners that are not distorted, and consistency with the calibration."""
     report = decide(matches)
-    assert report.case == case and report.alpha == pytest.approx(alpha, abs=1e-3)
+    assert report.alpha == pytest.approx(alpha, abs=1e-3)
     assert np.allclose(report.H_base, translation(*shift), atol=0.05) and re.search(reason, report.reason)
-    assert report.quality == pytest.approx(1 - alpha if report.inliers else 0, abs=1e-3)
+    assert report.quality == pytest.approx(1 - alpha, abs=1e-3)
 
 
 # --- stage 3: objects -------------------------------------------------------------------------------------------------
@@ -189,17 +185,15 @@ def test_clusters_are_objects() -> None:
     assert objects[0].confidence == 1.0
     # 9 points in a 20 px square count as in one of 30: ρ = 9, 9 / 13; w = 1 · 0.25 · 9 / 13.
     assert objects[0].weight(CONFIG) == pytest.approx(0.25 * 9 / 13)
-    report = align_objects(objects, EYE, 800, CONFIG)
-    assert np.allclose(report.shift_px, (5, -2))
-    assert np.allclose(report.H_aligned[:2, 2], (2.5, -1))
-    assert report.reason == "2 objects (far, ground) shift it by 0.5 x (+5.0, -2.0) px"
+    H_aligned, reason = align_objects(objects, EYE, 800, CONFIG)
+    assert np.allclose(H_aligned[:2, 2], (2.5, -1))
+    assert reason == "2 objects (far, ground) shift it by 0.5 x (+5.0, -2.0) px"
 
 
 def test_no_match_noise_one_cluster_and_identical_points() -> None:
     def declines(matches: Matches) -> None:
-        report = align_objects(find_objects(matches, EYE, EYE, CAMERA, 0.0), EYE, 800, CONFIG)
-        assert report.reason == "no cluster of matches: nothing to align"
-        assert np.array_equal(report.H_aligned, EYE) and not report.shift_px.any()
+        H_aligned, reason = align_objects(find_objects(matches, EYE, EYE, CAMERA, 0.0), EYE, 800, CONFIG)
+        assert reason == "no cluster of matches: nothing to align" and np.array_equal(H_aligned, EYE)
 
     declines(NO_MATCHES)
     declines(Matches(cluster_at(100, 100)[:3], cluster_at(100, 100)[:3]))  # fewer than min_samples
@@ -207,19 +201,19 @@ def test_no_match_noise_one_cluster_and_identical_points() -> None:
     assert (clusters(scattered, 30.0, 4) == -1).all()
     declines(Matches(scattered, scattered))
     (one,) = objects_of(cluster_at(600, 100), (2, 1))
-    assert np.allclose(align_objects([one], EYE, 800, CONFIG).shift_px, (2, 1))
+    assert np.allclose(align_objects([one], EYE, 800, CONFIG)[0][:2, 2], (1, 0.5))
     (same,) = objects_of(np.full((6, 2), 100.0), (1, 1))
     assert same.points == 6 and np.isfinite(same.weight(CONFIG))
-    assert np.allclose(align_objects([same], EYE, 800, CONFIG).shift_px, (1, 1))
+    assert np.allclose(align_objects([same], EYE, 800, CONFIG)[0][:2, 2], (0.5, 0.5))
 
 
 def test_long_shifts_and_worthless_types_decline() -> None:
     objects = objects_of(cluster_at(600, 100), (9, 9))
-    report = align_objects(objects, EYE, 800, CONFIG)
-    assert report.reason == "1 objects ask for 12.7 px, more than 12.0" and np.array_equal(report.H_aligned, EYE)
-    assert align_objects(objects, EYE, 1600, CONFIG).shift_px.any()  # lengths scale with the target's width
+    H_aligned, reason = align_objects(objects, EYE, 800, CONFIG)
+    assert reason == "1 objects ask for 12.7 px, more than 12.0" and np.array_equal(H_aligned, EYE)
+    assert align_objects(objects, EYE, 1600, CONFIG)[0][:2, 2].any()  # lengths scale with the target's width
     worthless = PaperConfig(far_weight=0.0)
-    assert align_objects(objects, EYE, 800, worthless).reason == "1 clusters, none with a positive type weight"
+    assert align_objects(objects, EYE, 800, worthless)[1] == "1 clusters, none with a positive type weight"
 
 
 # --- stage 4: fusion --------------------------------------------------------------------------------------------------
