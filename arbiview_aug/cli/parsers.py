@@ -19,7 +19,7 @@ SIZE, FULL_SIZE = (256, 704), (900, 1600)
 SCORED = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
 """Geometry that ``bench`` scores, and the sample key that offers it."""
 
-_KINDS = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
+_KINDS = "{kinds}"  # ``READERS`` when a parser is made: an example of the pages adds a row
 _CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _TARGET = f"(default: a higher five-camera rig; of real frames, {REAL_TARGET})"
 
@@ -108,6 +108,8 @@ def add_options(parser: argparse.ArgumentParser, *flags: str, without: str = "",
     """Add options; ``changes`` replace entries of ``_OPTIONS``. Help texts end in the default, ``without`` in words."""
     for flag in flags:
         option = {**_OPTIONS.get(flag, {}), **changes}
+        kinds = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
+        option["help"] = option["help"].replace(_KINDS, kinds)
         default = option.get("default")
         if option.get("required"):
             option["help"] = option["help"].partition(" (default")[0]
