@@ -188,7 +188,7 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands
     # Clear matches away from the outlines of objects, which windows blur.
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
-        q, valid = stand_on_road(image, costs, float(walls[1]), q, valid)
+        q, valid = stand_on_road(image, others, costs, float(walls[1]), q, valid)
     return q, valid
 
 

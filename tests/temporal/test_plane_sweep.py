@@ -88,7 +88,7 @@ def painted(along_m: Any, aside_m: Any) -> Any:
 
 
 def photograph(
-    ahead_m: float, board_m: float, legs: bool = False, size_m: tuple[float, float] = (2.0, 1.5)
+    ahead_m: float, board_m: float, aside_m: float, legs: bool = False, size_m: tuple[float, float] = (2.0, 1.5)
 ) -> SweptImage:
     """An image of a road from a camera so far ahead, and of an upright board, so wide and high, on the road.
 
@@ -99,7 +99,7 @@ def photograph(
     road = eye + rays * (eye[2] / np.maximum(-rays[..., 2], 1e-2))[..., None]
     far = eye + rays * ((60 - eye[0]) / np.maximum(rays[..., 0], 1e-2))[..., None]
     board = eye + rays * ((board_m - eye[0]) / np.maximum(rays[..., 0], 1e-2))[..., None]
-    y, z = board[..., 1] - ASIDE_M, board[..., 2]
+    y, z = board[..., 1] - aside_m, board[..., 2]
     asphalt, wall = 70 + painted(road[..., 0], road[..., 1]) / 5, painted(far[..., 2] / 4, far[..., 1] / 4)
     grey = np.where(road[..., 0] < 60, asphalt, wall)
     on = (np.abs(y) < size_m[0] / 2) & (z > 0) & (z < size_m[1]) & ((z > 0.6) | (np.abs(y) > 0.6) | (not legs))
@@ -107,13 +107,15 @@ def photograph(
 
 
 def distances(
-    stands: bool, by_m: float = 0.0, legs: bool = False, size_m: tuple[float, float] = (2.0, 1.5)
+    stands: bool, by_m: tuple[float, float], legs: bool = False, size_m: tuple[float, float] = (2.0, 1.5)
 ) -> tuple[float, float]:
     """Median distance of the board's middle, and the largest relative error of the road's before it.
 
-    The board moves by so much along the road while the camera travels ``TRAVEL_M``.
+    The board moves by so much, along and aside, while the camera travels ``TRAVEL_M``.
     """
-    before, now, after = (photograph(k * TRAVEL_M, BOARD_M + k * by_m, legs, size_m) for k in (-1, 0, 1))
+    before, now, after = (
+        photograph(k * TRAVEL_M, BOARD_M + k * by_m[0], ASIDE_M + k * by_m[1], legs, size_m) for k in (-1, 0, 1)
+    )
     q, valid = _match(now, [before, after], WALLS, stands=stands)
     upper, lower = (CAMERA.project(np.array([[BOARD_M, ASIDE_M + y, z]])).uv[0] for y, z in ((0.6, 1.2), (-0.6, 0.8)))
     part = np.s_[int(upper[1]) : int(lower[1]), int(upper[0]) : int(lower[0])]
@@ -123,13 +125,17 @@ def distances(
 
 
 def test_what_stands_stays() -> None:
-    assert distances(True) == distances(False)
+    assert distances(True, (0, 0)) == distances(False, (0, 0))
     for legs in (False, True):  # the road that is seen below a board does not make it hang
-        assert distances(True, legs=legs)[0] == pytest.approx(BOARD_M, rel=0.05)
+        assert distances(True, (0, 0), legs=legs)[0] == pytest.approx(BOARD_M, rel=0.05)
 
 
-@pytest.mark.parametrize("by_m", [-1.2, -4.0], ids=["comes", "comes fast"])
-def test_what_comes_stands_where_its_foot_is(by_m: float) -> None:
+@pytest.mark.parametrize(
+    "by_m",
+    [(-1.2, 0.0), (-4.0, 0.0), (1.2, 0.0), (0.0, -0.8)],
+    ids=["comes", "comes fast", "drives along", "crosses"],
+)
+def test_what_moves_stands_where_its_foot_is(by_m: tuple[float, float]) -> None:
     assert distances(False, by_m)[0] != pytest.approx(BOARD_M, rel=0.25)
     found_m, road_error = distances(True, by_m)
     assert found_m == pytest.approx(BOARD_M, rel=0.15) and road_error < 0.05
@@ -138,5 +144,5 @@ def test_what_comes_stands_where_its_foot_is(by_m: float) -> None:
 def test_what_is_too_slender_for_a_person_stays() -> None:
     """Wires, trunks and parts of the sky that hang above the road."""
     for size_m, is_right in (((0.6, 1.7), True), ((0.6, 4.0), False)):
-        found_m, _ = distances(True, -1.2, size_m=size_m)
+        found_m, _ = distances(True, (-1.2, 0.0), size_m=size_m)
         assert (abs(found_m - BOARD_M) < 0.15 * BOARD_M) == is_right
