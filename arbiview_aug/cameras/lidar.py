@@ -52,8 +52,9 @@ class Lidar:
             elevations = ()
         check, beams = partial(checked_array, self._where), len(elevations)
         expected = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
-        is_table = lambda table: 0 < beams <= MOST_BEAMS and abs(table).max() <= 90  # noqa: E731
-        table = check("elevations_deg", elevations, (-1,), expected, is_table)
+        table = check(
+            "elevations_deg", elevations, (-1,), expected, lambda deg: 0 < beams <= MOST_BEAMS and abs(deg).max() <= 90
+        )
         expected = "two azimuths in degrees, the first below the second by at most 360"
         ends = check("azimuth_deg", self.azimuth_deg, (2,), expected, lambda ends: 0 < ends[1] - ends[0] <= 360)
         expected = "two distances in metres, 0 <= the least < the largest"

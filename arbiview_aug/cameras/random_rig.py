@@ -146,12 +146,12 @@ class RandomRig(Epochs):
 
 def _range(name: str, value: Any) -> tuple[float, float]:
     is_scale = name == "focal_scale"
-    kind = "half-width below 1 or a positive" if is_scale else "half-width or a"
+    expected = f"a {'half-width below 1 or a positive' if is_scale else 'half-width or a'} (low, high)"
     pair = isinstance(value, tuple | list)
-    ends = checked_array("RandomRig", name, value, (2,) if pair else (), f"a {kind} (low, high)")
+    ends = checked_array("RandomRig", name, value, (2,) if pair else (), expected)
     low, high = ends.tolist() if pair else (is_scale - float(ends), is_scale + float(ends))
     if low > high or (is_scale and low <= 0):
-        raise refusal("RandomRig", name, f"a {kind} (low, high)", shown(value))
+        raise refusal("RandomRig", name, expected, shown(value))
     return low, high
 
 

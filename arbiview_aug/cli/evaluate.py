@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain, product
@@ -23,7 +24,7 @@ from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, GeometryWarning
 from arbiview_aug.evaluate.frames import (
     EXPOSURES,
     Evaluation,
@@ -35,7 +36,7 @@ from arbiview_aug.evaluate.frames import (
     retargeting,
 )
 from arbiview_aug.evaluate.held_out import common_scores, held_out_frames, photograph_tables, surfaces_for
-from arbiview_aug.evaluate.judges import TOO_FEW, Panel, Segmenter, load_detector, load_segmenter
+from arbiview_aug.evaluate.judges import FEWEST, TOO_FEW, Panel, Segmenter, load_detector, load_segmenter
 from arbiview_aug.evaluate.report.tables import evaluation_table, html_report, text_table, verdict_tables
 from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
@@ -62,11 +63,13 @@ def run(arguments: argparse.Namespace) -> None:
         raise DataError("; ".join(done.declined.values()))
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     complete = [name for name in names if name not in done.declined]  # judged on all frames
-    verdicts, tables = panel.rows(complete), [evaluation_table(done, complete)]
+    verdicts = panel.rows(complete)
     if arguments.held_out:
         tables = photograph_tables(done.views, complete, in_holes=in_holes)
+    else:
+        tables = [evaluation_table(done, complete)]
     tables += verdict_tables(verdicts)
-    if any(row.get("objects", 100) < 100 or row.get("images", 10) < 10 for row in verdicts.values()):
+    if any(row.get(unit, fewest) < fewest for row in verdicts.values() for unit, fewest in FEWEST.items()):
         notes.append(TOO_FEW)
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {frames_text(len({row['frame'] for row in done.views}))}"
@@ -111,6 +114,7 @@ def _held_out(
     data = open_frames(arguments, [*arguments.geometry, *([everything] if place_of is None else [])])
     chosen = chosen_frames(arguments.frames or len(data), len(data))
     with named_steps(notes, len(chosen)) as tick:
+        warnings.filterwarnings("ignore", "the target rig ", GeometryWarning)  # tables show what is seen
         frames = held_out_frames(data, chosen, asked, segmenter, place_of)
         if (first := next(frames, None)) is None:
             raise DataError("--held-out holes: expected a --target whose place leaves holes, found none")
@@ -124,7 +128,6 @@ def _held_out(
 
         compare = partial(common_scores, in_holes=in_holes)
         done = evaluate(chain([first], frames), lambda rig: rig, methods, step, look, compare)
-    notes[:] = [note for note in notes if not note.startswith("the target rig ")]  # tables show what is seen
     return methods, done
 
 

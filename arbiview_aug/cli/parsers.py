@@ -106,9 +106,9 @@ def command_parser(program: str, description: str, example: str) -> argparse.Arg
 
 def add_options(parser: argparse.ArgumentParser, *flags: str, without: str = "", **changes: Any) -> None:
     """Add options; ``changes`` replace entries of ``_OPTIONS``. Help texts end in the default, ``without`` in words."""
+    kinds = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
     for flag in flags:
         option = {**_OPTIONS.get(flag, {}), **changes}
-        kinds = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
         option["help"] = option["help"].replace(_KINDS, kinds)
         default = option.get("default")
         if option.get("required"):

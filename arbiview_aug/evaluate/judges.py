@@ -154,8 +154,11 @@ OVERLAP = 0.5  # least IoU of a hit, as in PASCAL VOC
 
 IntArray = npt.NDArray[np.int64]
 
-TOO_FEW = "rows of fewer than 100 objects or 10 images are too few to tell methods apart; add frames"
+FEWEST = {"objects": 100, "images": 10}
 """A share of fewer objects has a wide interval, and a bootstrap over fewer images says little."""
+
+_FEWEST_TEXT = " or ".join(f"{fewest} {unit}" for unit, fewest in FEWEST.items())
+TOO_FEW = f"rows of fewer than {_FEWEST_TEXT} are too few to tell methods apart; add frames"
 
 _DRAWS = 1000
 

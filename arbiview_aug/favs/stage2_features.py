@@ -149,7 +149,7 @@ def optimise_transformation(
     if min(side.stop - side.start for side in crop) - 1 < least:
         return unmatched(H_geometric, f"the overlap with the primary camera is narrower than {least:.0f} px")
     offset = np.array([crop[1].start, crop[0].start])
-    matches = match_features(_grey(warp.image)[crop], _grey(reference.image)[crop], both[crop], config.ratio)
+    matches = match_features(_grey(warp.image[crop]), _grey(reference.image[crop]), both[crop], config.ratio)
     rows, columns = bounding_box(warp.coverage)
     corners = [(x, y) for x in (columns.start, columns.stop - 1) for y in (rows.start, rows.stop - 1)]
     matches = Matches(matches.warped + offset, matches.reference + offset)

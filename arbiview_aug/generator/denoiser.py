@@ -47,9 +47,7 @@ class Denoiser(nn.Module):
         config: With ``residual`` the network predicts the residual between image and condition.
     """
 
-    signal: torch.Tensor | None = (
-        None  # (T,) √ᾱ_t of the schedule, if ``residual``; half precision would round a buffer
-    )
+    signal: torch.Tensor | None = None  # (T,) √ᾱ_t of the schedule, if ``residual``; no buffer: halves would round it
     deviation: torch.Tensor  # (2,) of the residual inside holes and outside; measured before training
 
     def __init__(self, unet: Any, config: GeneratorConfig) -> None:

@@ -68,6 +68,11 @@ class Hole:
         directions = np.moveaxis(np.tensordot(self.camera.cam2ego[:3, :3], self.rays.at(y, x), 1), 0, -1)
         return directions, np.maximum(self.inverse_distance[np.ix_(y, x)].astype(np.float64), 1e-6)
 
+    @cached_property
+    def wanted(self) -> BoolArray:
+        """Pixels (h, w) to plan in neighbours."""
+        return self.free | self.seam
+
 
 class Fill(NamedTuple):
     """One neighbour's views of the holes."""
@@ -156,7 +161,7 @@ def plan_fills(
     # A neighbour's cameras are not blended: one of them may see a moved object.
     config = replace(config, seam_width=0.0, layers=False)
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
-    wanted, fills = [hole.free | hole.seam for hole in holes], []
+    wanted, fills = [hole.wanted for hole in holes], []
     for neighbour in neighbours:
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
         objects = BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None
@@ -203,7 +208,7 @@ def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
     """The part of a hole that a neighbour shows."""
     from arbiview_aug.scene.kernels import upsample_where
 
-    usable = view.coverage & (hole.free | hole.seam)
+    usable = view.coverage & hole.wanted
     blur, risk = np.zeros(usable.shape, np.uint8), np.full(usable.shape, ChangeRisk.UNLABELLED, np.uint8)
     directions, q = hole.nodes
     for pair in view.pairs:

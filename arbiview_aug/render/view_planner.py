@@ -122,7 +122,7 @@ class ViewPlanner:
         occlusions, scales = [], []
         for k, level in self.used:
             hiding, coarser, source = OcclusionMap(_NO_IMAGE), level, self.pair.source.cameras[k]
-            if _is_measured(surface) and not self.is_far[k]:
+            if not surface.is_guess and not self.is_far[k]:
                 # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
                 coarser = level if surface.is_layered else max(level, occlusion_level(source))
                 half = halved_camera(source, coarser) if coarser else source
@@ -239,7 +239,7 @@ class ViewPlanner:
             at, bands = at.rounded(), tuple(replace(band, at=band.at.rounded()) for band in bands)
         edge = self._edge(at, winner, layout) if interpolation == "cubic" else None
         measured = None
-        if self.name in self._surfaces and _is_measured(self._surface(self.name)):
+        if self.name in self._surfaces and not self._surface(self.name).is_guess:
             measured = self._seen(self.name).q
         reports = tuple(self._reports(winner, won_px))
         plan = ViewPlan(at, winner, bands, reports, interpolation, certain, edge, measured=measured)
@@ -387,11 +387,6 @@ def halved_camera(camera: Camera, level: int) -> Camera:
 def _at(rows: Any, k: npt.NDArray[np.int64]) -> Any:
     """Rows k of all arrays in a structure of arrays."""
     return type(rows)(*(_at(part, k) if isinstance(part, tuple) else part[k] for part in rows))
-
-
-def _is_measured(surface: Any) -> bool:
-    """Whether a surface includes the objects on the street."""
-    return bool(surface.is_layered or not surface.is_guess)
 
 
 def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:

@@ -35,14 +35,19 @@ class ForwardProcess:
         self.signal, self.noise = alphas.sqrt().float(), (1 - alphas).sqrt().float()
         self.is_epsilon = config.prediction == "epsilon"
 
+    def _at(self, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """a and s at t, (B, 1, 1, 1, 1)."""
+        a, s = (values.to(t.device)[t].view(-1, 1, 1, 1, 1) for values in (self.signal, self.noise))
+        return a, s
+
     def noised(self, x0: torch.Tensor, eps: torch.Tensor, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """x_t (B, N, C, h, w) of x0 and ε, and the target of its prediction: ε, or v = a ε − s x0 (Salimans & Ho)."""
-        a, s = (values.to(t.device)[t].view(-1, 1, 1, 1, 1) for values in (self.signal, self.noise))
+        a, s = self._at(t)
         return a * x0 + s * eps, eps if self.is_epsilon else a * eps - s * x0
 
     def x0(self, x: torch.Tensor, predicted: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         """Estimate x0 from the prediction at x_t; inaccurate at late t with ε."""
-        a, s = (values.to(t.device)[t].view(-1, 1, 1, 1, 1) for values in (self.signal, self.noise))
+        a, s = self._at(t)
         return (x - s * predicted) / a.clamp(min=1e-4) if self.is_epsilon else a * x - s * predicted
 
 
