@@ -122,7 +122,7 @@ def add_options(parser: argparse.ArgumentParser, *flags: str, without: str = "",
 
 _SCORED = "surfaces to score (default: all that the samples offer)"
 _CHECKED = "real frames, by their path alone or with their kind; a rig file or a calibration"
-_TRAINED = f"synthetic, or real frames: {' or '.join(f'{kind}:PATH' for kind in READERS)} (default: synthetic)"
+_TRAINED = f"synthetic, or real frames as KIND:PATH (default: synthetic). {_KINDS}"
 _RIGS = (
     f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), another tool's calibration "
     "(docs/rigs.md), or data as other commands' --data takes it: the rig of its first frame"

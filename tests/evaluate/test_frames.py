@@ -18,7 +18,14 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, dem
 from arbiview_aug.evaluate.frames import Evaluation, evaluate, make_frame, retargeting, scores
 from arbiview_aug.evaluate.lidar import coloured_points, lidar_split
 from arbiview_aug.evaluate.metrics import RenderedView, as_arrays
-from arbiview_aug.evaluate.report.pictures import HOLE, frame_sheet, hatched_view, left_to_right, rig_figure
+from arbiview_aug.evaluate.report.pictures import (
+    HOLE,
+    contact_sheet,
+    frame_sheet,
+    hatched_view,
+    left_to_right,
+    rig_figure,
+)
 from arbiview_aug.evaluate.report.tables import TRUTH_COLUMNS, html_report, layers
 from arbiview_aug.favs.config import PaperConfig
 from tests.helpers import camera, street_sample
@@ -94,6 +101,13 @@ def test_sheets_hatch_only_what_is_unseen() -> None:
     assert holed.shape[0] > 1.7 * whole.shape[0], "two rows more: hatched, and the truth"
     hatched = (hatched_view(RenderedView(images[0], half), 40) == HOLE).all(-1)
     assert hatched[:, :25].any() and not hatched[:, 35:].any()
+
+
+def test_text_is_as_large_a_part_of_wide_sheets() -> None:
+    row = ("title", [np.full((30, 90, 3), 255, np.uint8)], ["caption"])
+    for rows in ([row], [("", *row[1:])]):
+        heights = [np.ptp(np.flatnonzero((contact_sheet(rows, width_px=w) < 128).any((1, 2)))) for w in (900, 3600)]
+        assert heights[1] > 3.8 * heights[0], "text shrinks with the sheet where a page shows it"
 
 
 def pictures(sample: Mapping[str, Any]) -> list[np.ndarray]:

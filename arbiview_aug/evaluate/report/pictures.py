@@ -37,44 +37,49 @@ _DOT = {"marker": "o", "linestyle": "", "color": "#00a0a0", "markersize": 7, "ma
 """Style of scanners."""
 
 _GAP_PX = 6
-_CAPTION_PX, _CAPTION_SCALE = 20, 0.42
-_TITLE_PX = 28
+_CAPTION, _TITLE = 0.5, 0.65  # OpenCV's scales of text on sheets up to ``_TEXT_SHEET_PX`` wide; wider ones have larger
+_TEXT_SHEET_PX = 900
+_LINE_PX = 40  # height of a line of text at scale 1
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-
-
-def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> None:
-    """Write ASCII text in place, its baseline starting at ``xy``."""
-    # OpenCV's fonts print '?' for all other characters.
-    text = text.replace("−", "-").replace("°", " deg").encode("ascii", "replace").decode()
-    cv2.putText(picture, text, xy, _FONT, scale, INK, 1, cv2.LINE_AA)
 
 
 def contact_sheet(rows: Sequence[tuple[str, Sequence[Image], Sequence[str]]], *, width_px: int = 1800) -> Picture:
     """Lay out rows of a title, images (h, w, 3), scale 0-255, and captions, which are cut where too long."""
+    zoom = max(1.0, width_px / _TEXT_SHEET_PX)
     strips = []
     for title, images, captions in rows:
         if title:
-            strips.append(np.full((_TITLE_PX, width_px, 3), PAPER, np.uint8))
-            put_text(strips[-1], title, (_GAP_PX, _TITLE_PX - 8), 0.6)
-        strips.append(_row(images, captions, width_px))
+            strips.append(_line_of_text([(title, _GAP_PX, width_px - _GAP_PX)], width_px, _TITLE * zoom))
+        strips += _row(images, captions, width_px, _CAPTION * zoom)
     return np.concatenate([*strips, np.full((_GAP_PX, width_px, 3), PAPER, np.uint8)])
 
 
-def _row(images: Sequence[Image], captions: Sequence[str], width_px: int) -> Picture:
+def _row(images: Sequence[Image], captions: Sequence[str], width_px: int, scale: float) -> list[Picture]:
+    """Strips of a row's images, and of their captions."""
     aspects = [image.shape[1] / image.shape[0] for image in images]
     # A row of few images would otherwise be taller than the rest of the sheet.
     height = max(1, round(min((width_px - _GAP_PX * (len(images) + 1)) / sum(aspects), 0.3 * width_px)))
-    strip = np.full((_GAP_PX + height + _CAPTION_PX, width_px, 3), PAPER, np.uint8)
-    x = _GAP_PX
+    strip = np.full((_GAP_PX + height, width_px, 3), PAPER, np.uint8)
+    x, texts = _GAP_PX, []
     for image, aspect, caption in zip(images, aspects, captions, strict=True):
         w = max(1, min(round(aspect * height), width_px - x))
         interpolation = cv2.INTER_AREA if image.shape[0] > height else cv2.INTER_LINEAR
-        resized = cv2.resize(to_bytes(image), (w, height), interpolation=interpolation)
-        strip[_GAP_PX : _GAP_PX + height, x : x + w] = resized
-        while cv2.getTextSize(caption, _FONT, _CAPTION_SCALE, 1)[0][0] > w:
-            caption = caption[:-1]
-        put_text(strip, caption, (x, _GAP_PX + height + 14), _CAPTION_SCALE)
+        strip[_GAP_PX:, x : x + w] = cv2.resize(to_bytes(image), (w, height), interpolation=interpolation)
+        texts.append((caption, x, w))
         x += w + _GAP_PX
+    return [strip, _line_of_text(texts, width_px, scale)]
+
+
+def _line_of_text(texts: Sequence[tuple[str, int, int]], width_px: int, scale: float) -> Picture:
+    """Strip with texts, each from its x on and at most as wide as it says."""
+    height, thickness = round(_LINE_PX * scale), max(1, round(scale))
+    strip = np.full((height, width_px, 3), PAPER, np.uint8)
+    for text, x, w in texts:
+        # OpenCV's fonts print '?' for all other characters.
+        shown = text.replace("−", "-").replace("°", " deg").encode("ascii", "replace").decode()
+        while cv2.getTextSize(shown, _FONT, scale, thickness)[0][0] > w:
+            shown = shown[:-1]
+        cv2.putText(strip, shown, (x, round(0.7 * height)), _FONT, scale, INK, thickness, cv2.LINE_AA)
     return strip
 
 
@@ -169,7 +174,7 @@ def frame_sheet(
         # At the size of the sheet, since finer hatching would blur.
         height = round(width_px / sum(image.shape[1] / image.shape[0] for image in rendered))
         hatched = [hatched_view(view, height) for view in views]
-        captions = [f"{name}: {share:.1%} unseen" for name, share in zip(names, unseen, strict=True)]
+        captions = [f"{share:.1%} unseen" for share in unseen]
         rows.append((f"Hatched: what no source camera saw, {np.mean(unseen):.1%}", target, hatched, captions))
     if truth is not None:
         rows.append((f"The truth: what {vehicle} would have seen", target, truth, names))
@@ -248,7 +253,7 @@ def rig_figure(rigs: Sequence[Rig]) -> Any:
     """Draw a column per rig, from above and the side: fields of view, scanners as dots, heights over the road."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8 * len(rigs), 10.5), dpi=100, layout="constrained")
+    figure = Figure(figsize=(5.5 * len(rigs), 7), dpi=145, layout="constrained")
     rows = figure.subplots(2, len(rigs), squeeze=False, sharex="row", sharey="row", height_ratios=(7, 3))
     for column, (above, side) in enumerate(rows.T):
         for k, rig in enumerate(rigs):
@@ -270,7 +275,7 @@ def rig_figure(rigs: Sequence[Rig]) -> Any:
             y, x = camera.center_m[1::-1] + (_radius_m(camera) + 0.2) * np.array([left, forward])
             text = f"{camera.name}\n{camera.fov_deg[0]:.0f}° x {camera.fov_deg[1]:.0f}°"
             aligned = {"ha": "right" if left > 0.3 else "left" if left < -0.3 else "center"}
-            above.text(y, x, text, fontsize=8, va="bottom" if forward > 0 else "top", **aligned)
+            above.text(y, x, text, fontsize=9, va="bottom" if forward > 0 else "top", **aligned)
         for lidar in shown.lidars:
             x, y, z = lidar.center_m - (0, 0, shown.ground_z_m)
             above.plot(y, x, **_DOT)
@@ -279,7 +284,7 @@ def rig_figure(rigs: Sequence[Rig]) -> Any:
         above.set(xlabel="left (m)", ylabel="forward (m)", aspect="equal")
         side.set(xlabel="forward (m)", ylabel="height over the road (m)", aspect="equal")
         side.axhline(0, color="grey", linewidth=3)
-        for axes, margins in ((above, (0.15, 0.15)), (side, (0.15, 0.05))):
+        for axes, margins in ((above, (0.35, 0.15)), (side, (0.15, 0.05))):
             axes.grid(alpha=0.3)
             axes.margins(*margins)
     above.invert_xaxis()
