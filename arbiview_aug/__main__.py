@@ -6,7 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 
-from arbiview_aug.cli.parsers import COMMANDS, Command, check_together, parser_of
+from arbiview_aug.cli.parsers import COMMANDS, check_together, parser_of
 from arbiview_aug.environment import imported, installed_version
 from arbiview_aug.errors import exit_status
 
@@ -36,21 +36,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"python -m arbiview_aug: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return 2
-    return run(f"python -m arbiview_aug {name}", name, COMMANDS[name], rest)
-
-
-def run(program: str, name: str, command: Command, argv: Sequence[str] | None) -> int:
-    """Parse a command's arguments, import it and run it; the exit status of ``main``."""
 
     def parsed_and_run() -> int | None:
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")  # names of files that are not UTF-8
         parser = parser_of(name)
-        arguments = parser.parse_args(argv)
-        check_together(name, parser, arguments)
-        return imported(f"arbiview_aug.{command.module}:run")(arguments)
+        parsed = parser.parse_args(rest)
+        check_together(name, parser, parsed)
+        return imported(f"arbiview_aug.{COMMANDS[name].module}:run")(parsed)
 
-    return exit_status(program, parsed_and_run, resumable=command.resumable)
+    return exit_status(f"python -m arbiview_aug {name}", parsed_and_run, resumable=COMMANDS[name].resumable)
 
 
 if __name__ == "__main__":

@@ -64,6 +64,7 @@ TINY = {
     "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
     "evaluate --data FOLDER --target waymo --geometry learned street": ["--downscale", "4", "--geometry", "street"],
     "train --output output/compact": ["--quiet", *SMALLER],
+    "train --data frames:DIR --output output/compact": ["--quiet", *SMALLER],
     "view FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
     "view FOLDER --output view.rrd": ["--downscale", "4", "--size", "40x72"],
 }
@@ -73,6 +74,7 @@ SLOW = (
     "bench",
     "depth --model",
     "evaluate --data FOLDER --target waymo --geometry learned",
+    "train --data",
     "view",
 )
 

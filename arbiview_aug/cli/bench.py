@@ -30,7 +30,6 @@ from arbiview_aug import PlanCache
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import REAL_TARGET, writable_folder
-from arbiview_aug.cli.parsers import SCORED
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.environment import one_thread, versions
@@ -44,7 +43,7 @@ from arbiview_aug.evaluate.frames import (
     scores,
     without_masks,
 )
-from arbiview_aug.evaluate.held_out import WithoutCamera
+from arbiview_aug.evaluate.held_out import WithoutCamera, surfaces_for
 from arbiview_aug.evaluate.metrics import as_arrays, mean_of
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.render.plan import RenderConfig
@@ -138,7 +137,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         target = target.undistorted()
 
     num_frames = min(arguments.frames, len(opened[reduces[0]]))
-    offered: list[Any] = [name for name, key in SCORED.items() if key in first]
+    offered: list[GeometryName] = ["infinity", *surfaces_for(first)]
     surfaces = [name for name in offered if not arguments.geometry or name in arguments.geometry]
     chosen = settings(surfaces, arguments.quality, reduces)
     if not chosen or not {*offered}.issuperset(arguments.geometry or ()):

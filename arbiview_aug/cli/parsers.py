@@ -16,9 +16,6 @@ from arbiview_aug.datasets.registry import READERS
 SIZE, FULL_SIZE = (256, 704), (900, 1600)
 """Sizes (h, w) of the views that benchmarks render."""
 
-SCORED = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
-"""Geometry that ``bench`` scores, and the sample key that offers it."""
-
 _KINDS = "{kinds}"  # ``READERS`` when a parser is made: an example of the pages adds a row
 _CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _TARGET = f"(default: a higher five-camera rig; of real frames, {REAL_TARGET})"
@@ -120,6 +117,7 @@ def add_options(parser: argparse.ArgumentParser, *flags: str, without: str = "",
         parser.add_argument(flag, **option)
 
 
+_SURFACES = ("infinity", "ground", "street", "boxes", "lidar")  # that ``bench`` scores
 _SCORED = "surfaces to score (default: all that the samples offer)"
 _CHECKED = "real frames, by their path alone or with their kind; a rig file or a calibration"
 _TRAINED = f"synthetic, or real frames as KIND:PATH (default: synthetic). {_KINDS}"
@@ -152,7 +150,7 @@ COMMANDS = {
             ("--size", {"default": SIZE, "help": "of every view"}),
             ("--frames", {"help": "frames for accuracy"}),
             ("--quality", {"nargs": "+", "default": [*get_args(Quality)], "help": "presets"}),
-            ("--geometry", {"nargs": "+", "choices": [*SCORED], "default": None, "help": _SCORED}),
+            ("--geometry", {"nargs": "+", "choices": _SURFACES, "default": None, "help": _SCORED}),
             ("--downscale", {"nargs": "+", "default": [*get_args(Reduce)]}),
         ],
     ),
@@ -241,8 +239,8 @@ COMMANDS = {
     "train": Command(
         "generator.training.trainer",
         "Train the generator that fills holes: CVC-SSL, to reconstruct real views from pseudo views. The same command "
-        "with the same --output goes on where it stopped. Several GPUs: accelerate launch -m arbiview_aug.train …, or "
-        "torchrun --nproc_per_node N -m arbiview_aug.train …",
+        "with the same --output goes on where it stopped. Several GPUs: accelerate launch -m arbiview_aug train …, or "
+        "torchrun --nproc_per_node N -m arbiview_aug train …",
         "--data nuscenes:ROOT --output output/compact --set steps=100",
         [
             ("--config", {}),
@@ -270,12 +268,9 @@ COMMANDS = {
 def parser_of(name: str) -> argparse.ArgumentParser:
     """Create the parser of a command."""
     command = COMMANDS[name]
-    program = "python -m arbiview_aug.train" if name == "train" else f"python -m arbiview_aug {name}"
-    parser = command_parser(program, command.description, command.example)
+    parser = command_parser(f"python -m arbiview_aug {name}", command.description, command.example)
     for flags, changes in command.options:
         add_options(parser, *flags.split(), **changes)
-    if name == "demo":
-        parser.set_defaults(reduce=1, clean_masks=False)
     return parser
 
 
@@ -307,5 +302,5 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
     if is_generated and given.get("generator") is None:
-        fix = "python -m arbiview_aug.train makes one, which convert and evaluate read"
+        fix = "python -m arbiview_aug train makes one, which convert and evaluate read"
         parser.error(f"argument --holes: diffusion needs --generator PATH: {fix}")

@@ -131,8 +131,6 @@ def scene_mask(camera: Camera) -> BoolArray:
 
 def without_masks(rig: Rig) -> Rig:
     """The same rig without car-body masks."""
-    if all(camera.mask is None for camera in rig):
-        return rig
     return rig.with_cameras([replace(camera, mask=None) for camera in rig])
 
 

@@ -140,7 +140,7 @@ class Diffusion(Inpainter, torch.nn.Module):
     On a GPU it needs ``num_workers=0``, or ``complete_batch`` after collating.
 
     Args:
-        generator: A generator, or the folder of one, which ``python -m arbiview_aug.train`` makes.
+        generator: A generator, or the folder of one, which ``python -m arbiview_aug train`` makes.
         steps: Denoising steps, from 1 (regression) on; the generator's default if None.
         guidance: Classifier-free guidance, 1 for none; the generator's default if None.
         min_confidence: As for every ``Inpainter``, like ``seed``.
@@ -167,7 +167,7 @@ class Diffusion(Inpainter, torch.nn.Module):
         super().__init__()
         self.min_confidence, self.seed = checked_settings(min_confidence, seed, steps, guidance)
         if generator is None:
-            fix = "python -m arbiview_aug.train trains one on your frames (docs/holes.md); holes='continue' needs none"
+            fix = "python -m arbiview_aug train trains one on your frames (docs/holes.md); holes='continue' needs none"
             raise GeneratorError(f"Diffusion: expected a generator or its folder, got none: {fix}")
         if not isinstance(generator, Generator | str | Path):
             raise ValueError(f"generator: expected a Generator or its folder, got {type(generator).__name__}")

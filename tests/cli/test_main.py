@@ -91,7 +91,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("inspect large.yaml", r"a file of 23\.8 MiB, more than 1\.0 MiB"),
         *((f"check {name}", "expected at most 128 cameras, got 1[25].") for name in ("crowd", "few")),
         ("convert --data frame --target waymo --output o --version v1.0-mini", "expected no version, which a frame f"),
-        ("demo --holes diffusion", "argument --holes: diffusion needs --generator PATH: python -m arbiview_aug.train"),
+        ("demo --holes diffusion", "argument --holes: diffusion needs --generator PATH: python -m arbiview_aug train"),
         ("evaluate --holes diffusion --generator no/no/no", "generator no/no/no: expected a folder of a generator"),
         ("evaluate --quality paper fast --geometry street", "quality paper knows infinity alone, got street"),
         ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion"),
@@ -207,8 +207,7 @@ def test_usage(capsys: pytest.CaptureFixture[str]) -> None:
 def test_help_imports_nothing_that_takes_time() -> None:
     """Neither torch nor OpenCV nor numba, and none of the package's modules of work, before arguments are parsed."""
     code = f"""
-import contextlib, io, sys
-from arbiview_aug import train
+import contextlib, io, runpy, sys
 from arbiview_aug.__main__ import main
 for words in {["", *COMMANDS]}:
     with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
@@ -216,8 +215,10 @@ for words in {["", *COMMANDS]}:
     assert "usage: python -m arbiview_aug" in said.getvalue(), words
     loaded = {{"torch", "cv2", "numba", "sklearn", "diffusers", "arbiview_aug.scene"}} & {{*sys.modules}}
     assert not loaded, (words, loaded)
-with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
-    train.main(["--help"])
+sys.argv = ["train", "--help"]
+with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+    runpy.run_module("arbiview_aug.train", run_name="__main__")
+assert "usage: python -m arbiview_aug train" in said.getvalue()
 assert "torch" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500)

@@ -1,4 +1,4 @@
-"""CVC-SSL training (Sec. Cross-View Consistency Self-Supervised Learning): ``python -m arbiview_aug.train --help``.
+"""CVC-SSL training (Sec. Cross-View Consistency Self-Supervised Learning): ``python -m arbiview_aug train --help``.
 
 Needs accelerate and the generator's packages: ``pip install arbiview_aug[generator]``.
 """

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from arbiview_aug.__main__ import main
 from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.generator import Diffusion, Generator, load_inpainter
 from arbiview_aug.generator.config import GeneratorConfig, from_plain
@@ -17,7 +18,6 @@ from arbiview_aug.generator.training import pseudo_views, trainer
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.pseudo_views import Frames, collate, open_frames
 from arbiview_aug.generator.training.trainer import Trainer, hole_psnr, sampled
-from arbiview_aug.train import main
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.generator.small import SIZE, Pictures, frames
 from tests.generator.test_stable_diffusion import saved
@@ -49,9 +49,9 @@ def drawn_frames(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("preset", ["compact", "small"])  # those of Stable Diffusion are below
 def test_train_and_resume(drawn_frames: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], preset: str) -> None:
     common = ["--config", preset, "--output", str(tmp_path), "--quiet", *SMALLER]
-    assert main(common) == 0
+    assert main(["train", *common]) == 0
     assert Generator.from_pretrained(tmp_path / "generator").config.image_size == (16, 24)
-    assert main(common) == 0
+    assert main(["train", *common]) == 0
     assert "going on after step 2" in capsys.readouterr().out
 
 
@@ -59,7 +59,7 @@ def test_a_generator_without_a_state_is_refused_before_any_frame_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "generator").mkdir()
-    assert main(["--output", str(tmp_path), "--quiet"]) == 2
+    assert main(["train", "--output", str(tmp_path), "--quiet"]) == 2
     error = capsys.readouterr().err
     assert "generator: expected none, since" in error and error.count("\n") == 1
 
@@ -81,7 +81,7 @@ def test_what_cannot_be_used_is_said_in_one_line(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     few = ["--set", "scenes=1", "--set", "generator.image_size=[8, 16]", "--quiet", "--output", str(tmp_path / "o")]
-    assert main([*arguments, *few, "--set", "loss.perceptual=0"]) == 2
+    assert main(["train", *arguments, *few, "--set", "loss.perceptual=0"]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert (tmp_path / "o").exists() == ("such as loss.geo=0" not in message)
@@ -91,7 +91,7 @@ def test_a_missing_package_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "accelerate", None)
-    assert main(["--output", str(tmp_path), "--quiet"]) == 2
+    assert main(["train", "--output", str(tmp_path), "--quiet"]) == 2
     error = capsys.readouterr().err
     assert error.endswith("accelerate is not installed: pip install 'arbiview_aug[generator]'\n")
     assert error.count("\n") == 1
@@ -244,9 +244,9 @@ def test_from_pretrained_weights_to_filled_holes(
     arguments = ["--config", "paper", "--quiet", *(f"--set={setting}" for setting in SETTINGS)]
 
     def train(folder: str) -> int:
-        return main([*arguments, "--weights", str(weights), "--output", str(tmp_path / folder)])
+        return main(["train", *arguments, "--weights", str(weights), "--output", str(tmp_path / folder)])
 
-    assert main([*arguments, "--output", str(tmp_path / "without")]) == 2
+    assert main(["train", *arguments, "--output", str(tmp_path / "without")]) == 2
     assert "Stable Diffusion 1.5 in" in capsys.readouterr().err
     assert train("whole") == 0
     # --- used as a filler
