@@ -21,7 +21,7 @@ FAR_AWAY_PX = np.float32(1e5)
 LENS_CODES = {
     "pinhole": 0, "radtan": 1, "fisheye": 2, "ftheta": 3, "ftheta_backward": 4, "double_sphere": 5, "eucm": 5
 }  # fmt: skip
-"""Lenses that kernels know. Others are projected by their class, image by image."""
+"""Code of each lens in ``project_row``."""
 
 _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
 _FOUR, _FIVE = np.float32(4), np.float32(5)

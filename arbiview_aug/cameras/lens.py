@@ -1,7 +1,7 @@
 """Lens models: one class per lens, and the table ``LENSES`` of all.
 
 A lens maps normalised image coordinates (x / z, y / z) to distorted ones, and back. A new lens is a subclass of
-``Lens`` with an entry in ``LENSES``.
+``Lens`` with an entry in ``LENSES``, and its formula in ``kernels.project_row`` with a code in ``LENS_CODES``.
 """
 
 from __future__ import annotations

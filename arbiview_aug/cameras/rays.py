@@ -243,16 +243,11 @@ def pixels_of(rays: Planes, inverse_distance: Planes, A: Any, o: Any, source: Ca
     ``rays`` are (3, h, w) unit rays, ``inverse_distance`` (h, w) is along them, 1/m. ``A`` (3, 3) turns them to the
     source's frame, and ``o`` (3,) is their start there.
     """
-    from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, project_image
+    from arbiview_aug.cameras.kernels import LENS_CODES, project_image
 
     rays, A, o = (np.ascontiguousarray(part, np.float32) for part in (rays, A, o))
     u, v = (np.empty(inverse_distance.shape, np.float32) for _ in range(2))
-    kind = LENS_CODES.get(source.lens, 0)
-    project_image(rays, inverse_distance, A, o, kind, source.parameters, u, v)
-    if source.lens not in LENS_CODES:
-        points = np.tensordot(A, rays, 1) + o[:, None, None] * inverse_distance
-        uv, _, valid = source.project_cam(np.moveaxis(points, 0, -1).astype(np.float64))
-        u, v = (np.where(valid, uv[..., k], FAR_AWAY_PX).astype(np.float32) for k in range(2))
+    project_image(rays, inverse_distance, A, o, LENS_CODES[source.lens], source.parameters, u, v)
     return u, v
 
 

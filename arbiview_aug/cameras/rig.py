@@ -1,8 +1,9 @@
 """Rigs: the cameras of one vehicle, their files, and the vehicles that ship with the package.
 
 A rig file (YAML or JSON) holds ``name``, ``ground_z_m`` and ``cameras``, each with ``name``, ``width``, ``height``,
-``K`` (3x3), ``cam2ego`` (4x4), ``distortion`` (null or ``{model: LENS, coeffs: [...]}``) and optionally
-``mask`` (a PNG next to the file, white = scene); optionally ``lidars``, each with the arguments of ``Lidar``.
+``K`` (3x3), ``cam2ego`` (4x4, or ``translation`` and ``rotation`` x y z w), ``distortion`` (null or
+``{model: LENS, coeffs: [...]}``) and optionally ``mask`` (a PNG next to the file, white = scene);
+optionally ``lidars``, each with the arguments of ``Lidar``.
 ``source``, ``notes``, ``ego_frame``, ``ground_source``, ``dataset``, ``kind`` and ``license`` document it.
 """
 
@@ -26,6 +27,7 @@ import numpy as np
 
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.formats.entries import pose_of
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.key_names import USUAL_NAMES, check_keys, lens_called, misnamed, refuse_unknown
 from arbiview_aug.cameras.lens import FloatArray, canonical_name
@@ -326,6 +328,8 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
             raise CalibrationError(f"{label}: {key!r} is not read: {fix}; got {shown(entry[key])}")
     mask = None if entry.get("mask") is None else read_mask(entry["mask"], folder, label)
     with calibration_of(where):
+        if isinstance(entry["cam2ego"], Mapping):
+            calibration["cam2ego"] = pose_of(f"camera {shown(entry['name'])}", entry["cam2ego"], "cam2ego")
         return Camera(width_px=entry["width"], height_px=entry["height"], mask=mask, **calibration)
 
 

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -241,9 +242,12 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
             return [Finding("cam2ego", "cameras that look where their names say", *set_mistake)]
     if is_known:
         return general
-    tilt = _tilt_mistake(cam2ego, sides, ground_z_m)
-    if tilt is not None:
-        return [Finding("cam2ego", "level cameras that look where their names say", *tilt)]
+    up = cam2ego[:, 2, 2]
+    is_tilted = len(up) > 1 and np.abs(up).max() > _TILTED and up.min() > -_STRAIGHT
+    for right, *tilt in _candidates(cam2ego) if is_tilted else ():
+        is_level = (np.abs(right[:, 2, 2]) < _LEVEL) & (right[:, 2, 1] < -0.9) & is_mounted(right, ground_z_m)
+        if is_level.all() and not any(map(_belies, right, sides, repeat(has_front))):
+            return [Finding("cam2ego", "level cameras that look where their names say", *tilt)]
     y_m, y_axes = cam2ego[:, 1, 3], cam2ego[:, 1, 2]
     aside = (np.abs(y_m) > 0.1) & (np.abs(y_axes) > 0.5)
     found = []
@@ -309,19 +313,6 @@ def _set_mistake(cam2ego: FloatArray, sides: Sequence[tuple[int, int]], is_body:
     if abs(turn) > _ALIKE and abs(turn_deg) > 60:
         fix = f"x of the ego frame is forward: turn poses, points and boxes by {-turn_deg:.0f} degrees about z"
         return f"all cameras turned by {turn_deg:.0f} degrees", fix
-    return None
-
-
-def _tilt_mistake(cam2ego: FloatArray, sides: Sequence[tuple[int, int]], ground_z_m: float) -> tuple[str, str] | None:
-    """Explain tilted cameras of a set by one mistake: without it all are level and look where their names say."""
-    up, has_front = cam2ego[:, 2, 2], (1, 0) in sides
-    if len(cam2ego) < 2 or np.abs(up).max() <= _TILTED or up.min() <= -_STRAIGHT:
-        return None
-    for right, mistake, fix in _candidates(cam2ego):
-        is_level = (np.abs(right[:, 2, 2]) < _LEVEL) & (right[:, 2, 1] < -0.9)
-        looks_aside = any(_belies(pose, side, has_front) for pose, side in zip(right, sides, strict=True))
-        if is_level.all() and is_mounted(right, ground_z_m).all() and not looks_aside:
-            return mistake, fix
     return None
 
 

@@ -19,6 +19,7 @@ import torch
 
 from arbiview_aug.atomic_io import check_name, inside
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.formats.entries import pose_of
 from arbiview_aug.cameras.formats.fields import unread_lens
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, canonical_name
@@ -184,6 +185,8 @@ class _Frame:
         """``ego2world``, None without."""
         if (value := self.calib.get("ego2world")) is None:
             return None
+        if isinstance(value, Mapping):
+            value = pose_of(self.where, value, "ego2world")
         try:
             pose = np.array(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -75,22 +75,16 @@ class OnImages(torch.nn.Module):
 
 def check_photometric(module: Callable[[torch.Tensor], torch.Tensor]) -> None:
     """Refuse modules of kornia and torchvision that move pixels, by name."""
-    bases = [(type(part).__name__, base) for part in _parts(module) for base in type(part).__mro__]
-    for name, base in bases:
-        if base.__module__ == "torchvision.transforms.transforms":  # judged by their namesakes in v2
-            from torchvision.transforms import v2
-
-            base = getattr(v2, base.__name__, base)
-        if base.__module__.startswith(_MOVING):
-            raise ValueError(
-                f"{name}: moves pixels and leaves K unchanged; resize and crop with RigRetarget's "
-                "size and fit, turn and shift cameras with RandomRig"
-            )
-
-
-def _parts(module: Any) -> Iterator[Any]:
-    """A module or function and its children; ``Compose`` of both versions keeps them in a plain list."""
     for part in module.modules() if isinstance(module, torch.nn.Module) else [module]:
-        yield part
-        for child in getattr(part, "transforms", ()):
-            yield from _parts(child)
+        for base in type(part).__mro__:
+            if base.__module__ == "torchvision.transforms.transforms":  # judged by their namesakes in v2
+                from torchvision.transforms import v2
+
+                base = getattr(v2, base.__name__, base)
+            if base.__module__.startswith(_MOVING):
+                raise ValueError(
+                    f"{type(part).__name__}: moves pixels and leaves K unchanged; resize and crop with RigRetarget's "
+                    "size and fit, turn and shift cameras with RandomRig"
+                )
+        for child in getattr(part, "transforms", ()):  # ``Compose`` of both versions keeps them in a plain list
+            check_photometric(child)

@@ -190,13 +190,11 @@ def _moved(out: DataDict, move: FloatArray) -> DataDict:
     changed: DataDict = {"points": moved_points(out["points"], move).numpy().astype(out["points"].dtype)}
     if (boxes := out.get("gt_boxes")) is not None:
         changed["gt_boxes"] = moved_by(boxes, move)
-    for key in ("lidar2camera", "lidar2image"):
-        if key in out:
-            changed[key] = [(matrix @ back).astype(matrix.dtype) for matrix in out[key]]
+    for key in out.keys() & {"lidar2camera", "lidar2image", "camera2lidar"}:
+        matrices = [move @ matrix if key == "camera2lidar" else matrix @ back for matrix in out[key]]
+        changed[key] = [moved.astype(matrix.dtype) for moved, matrix in zip(matrices, out[key], strict=True)]
     if "trans_lidar_to_cam" in out:  # KITTI's
         changed["trans_lidar_to_cam"] = (out["trans_lidar_to_cam"] @ back).astype(out["trans_lidar_to_cam"].dtype)
-    if "camera2lidar" in out:
-        changed["camera2lidar"] = [(move @ matrix).astype(matrix.dtype) for matrix in out["camera2lidar"]]
     if (calib := out.get("calib")) is not None:
         calib.V2C = (np.asarray(calib.V2C, np.float64) @ back).astype(calib.V2C.dtype)
     return out | changed

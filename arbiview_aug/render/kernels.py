@@ -170,7 +170,7 @@ def _look(
     A, o, P, kind, bounds = sources.A[k], sources.o[k], sources.P[k], sources.kind[k], sources.bounds[k]
     if kind == 0:
         _project_pinhole(block, A, o, P, x)
-    elif kind > 0:
+    else:
         turn_row(block.x, block.y, block.z, block.q, A, o, x, y, z)
         project_row(x, y, z, kind, P, floats[9, :n], floats[10, :n], u, v)
     low_u, low_v, high_u, high_v, right, bottom = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4], bounds[5]
@@ -219,12 +219,6 @@ def see_nodes(
             block.q[i] = surfaces.q[view.y[j], view.x[i]]
             block.face[i] = surfaces.face[view.y[j], view.x[i]] if has_faces else np.int32(-1)
         for k in range(K):
-            if sources.kind[k] < 0:
-                h, w = sources.positions.size[k, 0], sources.positions.size[k, 1]
-                positions = array_at(sources.positions.address[k], (h, w), np.float32)
-                for i in range(nx):
-                    block.u[i] = positions[view.y[j], view.x[i]]
-                    block.v[i] = positions[h // 2 + view.y[j], view.x[i]]
             _look(sources, k, occluders, block, has_faces, floats, ints, xy, tag)
             score = nodes.score[k, j]
             for i in range(nx):
@@ -287,13 +281,6 @@ def _plan_block(
     for k in range(sources.A.shape[0]):
         if not _is_in(some, k):
             continue
-        if sources.kind[k] < 0:
-            rows, columns = sources.positions.size[k, 0], sources.positions.size[k, 1]
-            positions = array_at(sources.positions.address[k], (rows, columns), np.float32)
-            for y in range(y0, y1):
-                for x in range(n):
-                    block.u[(y - y0) * n + x] = positions[y, x0 + x]
-                    block.v[(y - y0) * n + x] = positions[rows // 2 + y, x0 + x]
         to_xy, to_tag = (xy_1, tag_1) if is_first else (xy, tag)
         _look(sources, k, occluders, block, face_most >= 0, floats, ints, to_xy, to_tag)
         if several:

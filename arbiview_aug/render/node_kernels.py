@@ -59,9 +59,10 @@ def measure_nodes(view: View, sources: Sources, surfaces: Surfaces, antialias: b
     last_x = max(nx - 2 - (nx > 2 and view.x[nx - 1] == view.x[nx - 2]), 0)
     is_line = view.y[ny - 1] == view.y[0] or view.x[nx - 1] == view.x[0]
     rays, q, near_q = view.rays, surfaces.behind, np.empty(nx, np.float32)
+    u, v = np.empty((ny, nx), np.float32), np.empty((ny, nx), np.float32)
     for k in range(K):
-        u, v, offset_m, size = nodes.uv[k, 0], nodes.uv[k, 1], sources.offset_m[k], sources.size[k]
-        for j in range(ny if sources.kind[k] >= 0 else 0):
+        offset_m, size = sources.offset_m[k], sources.size[k]
+        for j in range(ny):
             turn_row(rays[0, j], rays[1, j], rays[2, j], q[j], sources.A[k], sources.o[k], work[0], work[1], work[2])
             project_row(work[0], work[1], work[2], sources.kind[k], sources.P[k], work[3], work[4], u[j], v[j])
         shape = sources.to_mask.size[k, 0], sources.to_mask.size[k, 1]
@@ -104,7 +105,7 @@ def measure_nodes(view: View, sources: Sources, surfaces: Surfaces, antialias: b
                 nodes.border[k, j, i] = border / max(fine, np.float32(1e-3))
                 nodes.parallax[k, j, i], nodes.resolution[k, j, i] = off, fine
                 inside += is_seen
-        if not is_near and surfaces.face.shape[0] and sources.kind[k] >= 0:  # it may see objects before the background
+        if not is_near and surfaces.face.shape[0]:  # it may see objects before the background
             for j in range(ny):
                 for i in range(nx):
                     near_q[i] = surfaces.q[view.y[j], view.x[i]]

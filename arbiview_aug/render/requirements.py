@@ -134,7 +134,7 @@ class RigPair:
         """Lens codes (N,), ``Camera.parameters`` (N, 14), sizes (N, 2) and bounds (N, 6) of the sources."""
         from arbiview_aug.cameras.kernels import LENS_CODES
 
-        codes = np.array([LENS_CODES.get(camera.lens, -1) for camera in self.source])
+        codes = np.array([LENS_CODES[camera.lens] for camera in self.source])
         bounds = np.array([source_bounds(size, 0) for size in self.source.sizes], np.float32)
         return codes, np.stack([camera.parameters for camera in self.source]), np.array(self.source.sizes), bounds
 

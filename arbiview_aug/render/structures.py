@@ -31,14 +31,13 @@ class Sources(NamedTuple):
 
     A: Any  # (K, 3, 3) float32 rotation from the target's frame
     o: Any  # (K, 3) float32 the target's centre in the source's frame; 0 where the scene counts as infinitely far
-    kind: Any  # (K,) int64 lens; -1 for lenses without a kernel
+    kind: Any  # (K,) int64 code of the lens
     P: Any  # (K, 14) float32 ``Camera.parameters``
     size: Any  # (K, 2) int64 height and width, not halved
     bounds: Any  # (K, 6) float32 least columns and rows of the image, largest ones; last pixel of a halved one, or -1
     offset_m: Any  # (K, 3) float32 the target's centre minus the source's, target's frame
     bonus: Any  # (K,) float32 factor of the weight
     slot: Any  # (K, 3) int32 number of the source; column and row of its image in the atlas
-    positions: Images  # (2 h, w) float32 columns, then rows, for lenses without a kernel
     to_mask: Images  # float32 distance of each cell of ``CELL_PX`` to the own car, pixels
     clean: Images  # uint8, 0 where the image shows the own car
 
@@ -70,7 +69,6 @@ class Nodes(NamedTuple):
     parallax: Any  # (K, ny, nx) float32 expected displacement, target pixels
     resolution: Any  # (K, ny, nx) float32 source pixels per target pixel along the worse axis
     near: Any  # (K, ny, nx) bool, whether the source's image may contain pixels of the cells around
-    uv: Any  # (K, 2, ny, nx) float32 columns and rows in the source; given where the lens is unknown
     halvings: Any  # (K,) int64 of the source's image before it is read; -1 where no pixel can lie in it
 
 

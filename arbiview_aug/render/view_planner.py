@@ -18,10 +18,10 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray, LensName
-from arbiview_aug.cameras.rays import RayCache, look_apart, source_pixels
+from arbiview_aug.cameras.rays import RayCache, look_apart
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
-from arbiview_aug.image_ops import at_level, level_size, some_of_cells
+from arbiview_aug.image_ops import level_size, some_of_cells
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.plan import (
     GRID_STEP_PX,
@@ -162,13 +162,8 @@ class ViewPlanner:
         self.sources = [k for k in pair.order if asked[k]]
         self._read = self._read_sources()
         shape = len(self.sources), *surfaces.behind.shape
-        uv = np.empty((shape[0], 2, *shape[1:]), np.float32)
-        for i in np.flatnonzero(self._read.kind < 0):
-            behind = surfaces.behind * np.float32(not self.is_far[self.sources[i]])
-            uv[i] = source_pixels(self.camera, self.view.rays, behind, pair.source.cameras[self.sources[i]])
         score, border, parallax, resolution = np.empty((4, *shape), np.float32)
-        places = np.empty(shape, bool), uv, np.empty(shape[0], np.int64)
-        self.nodes = Nodes(score, border, parallax, resolution, *places)
+        self.nodes = Nodes(score, border, parallax, resolution, np.empty(shape, bool), np.empty(shape[0], np.int64))
         measure_nodes(self.view, self._read, surfaces, self.config.antialias, self.nodes)
         seen = np.flatnonzero(self.nodes.halvings >= 0)
         if len(seen) < len(self.sources):
@@ -190,23 +185,18 @@ class ViewPlanner:
         none = Images(np.zeros(len(k), np.int64), np.zeros((len(k), 2), np.int64))
         to_mask = self._images([self.maps.to_mask(pair.source.cameras[i]) for i in self.sources])
         (kind, parameters, size, bounds), slots = (part[k] for part in pair.lenses), np.zeros((len(k), 3), np.int32)
-        return Sources(A, o, kind, parameters, size, bounds, offset_m, bonus, slots, none, to_mask, none)
+        return Sources(A, o, kind, parameters, size, bounds, offset_m, bonus, slots, to_mask, none)
 
     def _placed_sources(self, layout: AtlasLayout) -> Sources:
         """The sources as they are read: some halved, and with their places in an atlas."""
-        read, positions, clean = self._read, list[npt.NDArray[Any]](), list[npt.NDArray[Any]]()
+        read, clean = self._read, list[npt.NDArray[Any]]()
         for i, (k, level) in enumerate(self.used):
             camera, slot = self.pair.source.cameras[k], layout.slot(k, level)
             read.slot[i] = slot.source, slot.x, slot.y
             clean.append(self.maps.clean_pixels(camera, level))
             if level:
                 read.P[i], read.bounds[i] = camera.parameters_at(0.5**level), source_bounds(camera.size, level)
-            positions.append(_NO_IMAGE)
-            if read.kind[i] < 0:
-                q = self._seen("infinity" if self.is_far[k] else self.seen_name).q
-                uv = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), q, camera)
-                positions[i] = at_level(np.concatenate(uv), level).astype(np.float32)
-        return read._replace(positions=self._images(positions), clean=self._images(clean))
+        return read._replace(clean=self._images(clean))
 
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:

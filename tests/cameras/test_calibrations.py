@@ -315,6 +315,12 @@ def test_inspect_says_what_was_assumed(tmp_path: Path, capsys: pytest.CaptureFix
     assert said.count("read as Kalibr: T_cn_cnm1 takes points from the camera before") == 2
     assert "road at z = 0.0 m, by default" in said and "double_sphere" in said
     (tmp_path / "mounting.yaml").unlink()
+    of_foot = TF_STATIC.replace("/base_link", "/base_footprint").replace("base_link", "base_footprint")
+    ros = tmp_path / "ros"
+    ros.mkdir()
+    written(ros, front__yaml=CAMERA_INFO, tf_static__yaml=of_foot)
+    assert main(["inspect", str(ros / "front.yaml"), *output]) == 0
+    assert "road at z = 0.0 m, from base_footprint in tf_static.yaml" in capsys.readouterr().out
     assert main(["inspect", str(tmp_path), *output]) == 2
     assert "where is it on the vehicle?" in capsys.readouterr().err
 

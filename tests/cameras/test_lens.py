@@ -9,15 +9,12 @@ from typing import get_args
 import cv2
 import numpy as np
 import pytest
-import torch
 
-from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.cameras import lens as lens_module
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES
-from arbiview_aug.cameras.lens import BoolArray, FloatArray, Lens, LensName
+from arbiview_aug.cameras.lens import LensName
 from arbiview_aug.cameras.rays import source_pixels
-from arbiview_aug.errors import CalibrationError
 from tests.extremes import reference
 
 K = np.array([[410.0, 0.0, 318.0], [0.0, 405.0, 242.0], [0.0, 0.0, 1.0]])
@@ -154,48 +151,3 @@ def test_kernels_project_as_classes(name: str) -> None:
     sure = np.abs(np.arccos(directions @ camera.cam2ego[:3, 2]) - camera.lens_model.fold_rad) > 1e-2
     np.testing.assert_array_equal(u[sure] != FAR_AWAY_PX, want.valid[sure])
     np.testing.assert_allclose(camera.parameters_at(0.5), camera.resize((240, 320)).parameters, rtol=1e-6)
-
-
-class Stereographic(Lens):
-    """A toy lens: r = 2 tan(angle / 2), without coefficients."""
-
-    name = "stereographic"
-    aliases = ("my_stereographic",)
-    coefficient_counts = (0,)
-    sees_behind = True
-    fold_limit = math.radians(170)
-    fold_rad = fold_limit
-
-    def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        r = np.hypot(x, y)
-        angle = np.arctan2(r, z)
-        valid = (angle <= self.fold_limit) & ((r > 0) | (z > 0))
-        scale = 2 * np.tan(np.minimum(angle, self.fold_limit) / 2) / np.where(r > 0, r, 1)
-        return x * scale, y * scale, valid
-
-    def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
-        r = np.hypot(xd, yd)
-        angle = 2 * np.arctan(r / 2)
-        scale = np.sin(angle) / np.where(r > 0, r, 1)
-        return np.stack([xd * scale, yd * scale, np.cos(angle)], -1)
-
-
-def test_a_lens_is_added_by_its_class_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(CalibrationError, match=r"lens: expected one of pinhole, radtan, .*, eucm, got 'stereographic'"):
-        make("pinhole", lens="stereographic")
-    monkeypatch.setitem(lens_module.LENSES, "stereographic", Stereographic)
-    camera = make("pinhole", lens="my_stereographic", K=None, horizontal_fov_deg=200.0, roll_deg=0.0)
-    assert camera.lens == "stereographic" and camera.fov_deg[0] == pytest.approx(200)
-    assert camera.unproject(camera.project(camera.center_m + np.array([[5.0, 2.0, 1.0]])).uv).valid.all()
-    rig = Rig([camera.resize((48, 64))], name="toy")
-    assert Rig.from_dict(rig.to_dict())[0] == rig[0]
-    sample = {"images": torch.rand(1, 3, 48, 64), "rig": rig}
-    same = RigRetarget(rig)(sample)
-    assert same["lens"] == ["stereographic"] and same["coverage"].all()
-    torch.testing.assert_close(same["images"], sample["images"], atol=0.02, rtol=0)
-    # Its calibration comes back as a sample's keys.
-    again = {key: same[key] for key in ("images", "K", "cam2ego", "lens", "distortion")}
-    flat = RigRetarget(Rig([make("pinhole", roll_deg=0.0).resize((24, 32))], ground_z_m=0.0))
-    seen = flat(again)
-    assert seen["coverage"].all()
-    torch.testing.assert_close(seen["images"], flat(sample)["images"], atol=0.05, rtol=0)

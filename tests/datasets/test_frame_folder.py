@@ -61,6 +61,19 @@ def test_the_sample(tmp_path: Path) -> None:
         assert sample[key].shape == shape and sample[key].dtype == torch.float32
 
 
+def test_poses_of_quaternions(tmp_path: Path) -> None:
+    sample = FrameFolder(frame(tmp_path / "matrices"))[0]
+    forward = {"translation": sample["cam2ego"][0, :3, 3].tolist(), "rotation": [-0.5, 0.5, -0.5, 0.5]}
+
+    def change(calib: dict[str, Any]) -> None:
+        calib["cameras"][0]["cam2ego"] = forward
+        calib["ego2world"] = {"translation": {"x": 1, "y": 2, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 1, "w": 0}}
+
+    read = FrameFolder(frame(tmp_path / "quaternions", change))[0]
+    np.testing.assert_allclose(read["cam2ego"], sample["cam2ego"], atol=1e-12)
+    assert read["ego2world"][:2, [0, 3]].tolist() == [[-1, 1], [0, 2]]
+
+
 def test_a_folder_of_frames_in_the_order_of_their_names(tmp_path: Path) -> None:
     for name in ("c", "a", "b"):
         frame(tmp_path / name)
@@ -139,6 +152,8 @@ def renamed(key: str, name: str, camera: int | None = None) -> Change:
     [
         (edit("K", [[np.nan, 0, 32], [0, 40, 24], [0, 0, 1]], 0), CalibrationError, "'front': K: expected finite"),
         (edit("cam2ego", np.diag([1, 1, -1, 1]).tolist(), 0), CalibrationError, "'front': cam2ego: expected right"),
+        (edit("cam2ego", {"rotation": [1]}, 0), CalibrationError, "'front': cam2ego: expected a 4x4 matrix, or {trans"),
+        (edit("ego2world", {"x": 1}), CalibrationError, "ego2world: expected a 4x4 matrix, or {translation"),
         (edit("distortion", {"model": "mei", "coeffs": [1]}, 1), CalibrationError, "'back': lens: expected one of"),
         (edit("width", 1600, 0), DataError, r"'front': image .*expected 1600x48 \(w x h\) as calibrated, got 64x48"),
         (swapped, DataError, "expected 48x64 .*got 64x48; the calibration's width and height look swapped"),

@@ -31,7 +31,8 @@ from arbiview_aug.files import read_bytes
 # --- a file a camera: ROS, Foxglove, OpenCV, WoodScape and what Python scripts write ----------------------------------
 TF = "tf_static.yaml"
 SUFFIXES = (".yaml", ".yml", ".xml", ".json")
-_EGO_FRAMES = ("base_link", "base_footprint")  # REP 105; REP 120: base_footprint is on the floor
+_FOOTPRINT = "base_footprint"  # REP 120: on the floor
+_EGO_FRAMES = ("base_link", _FOOTPRINT)  # REP 105
 _BODY_UP_DEG = 60.0  # no car's camera looks up more steeply: its frame is the body's
 _OPTICAL = ("_optical_frame", "_optical", "")  # suffixes of a camera's frame; REP 103
 _WOODSCAPE_KEYS = set("aspect_ratio cx_offset cy_offset height width k1 k2 k3 k4 model poly_order".split())
@@ -185,12 +186,6 @@ def _pose(
     return pose
 
 
-def ros_road_z_m(folder: Path) -> float:
-    """Height of the road in the ego frame: that of base_footprint; 0 if tf has no such frame."""
-    foot = _frames(folder).get(_EGO_FRAMES[1], np.zeros((4, 4)))
-    return round(float(foot[2, 3]), 6) + 0.0  # not -0.0
-
-
 def _frames(path: Path) -> dict[str, FloatArray]:
     """Poses (4, 4) of the tf frames of a file's folder in the ego frame: base_link, or base_footprint without it."""
     tf = (path if path.is_dir() else path.parent) / TF
@@ -199,28 +194,25 @@ def _frames(path: Path) -> dict[str, FloatArray]:
     links: dict[str, tuple[str, FloatArray]] = {}
     for link in (link for message in read_documents(tf, TF) for link in message["transforms"]):
         child, parent = (frame.strip("/") for frame in (link["child_frame_id"], link["header"]["frame_id"]))
-        links[child] = parent, pose_of(child, link["transform"])
+        links[child] = parent, pose_of(f"camera {child!r}", link["transform"])
 
-    def climbed(at: str, end: str) -> tuple[str, FloatArray]:
+    def to_root(frame: str) -> tuple[str, FloatArray]:
         pose: FloatArray = np.eye(4)
         for _ in links:  # no more steps than links, which may run in a circle
-            if at in links and at != end:
-                at, pose = links[at][0], links[at][1] @ pose
-        return at, pose
+            if frame in links:
+                frame, pose = links[frame][0], links[frame][1] @ pose
+        return frame, pose
 
-    known = {*links, *(parent for parent, _ in links.values())}
-    ego = next((frame for frame in _EGO_FRAMES if frame in known), "")
-    root, ego2root = climbed(ego, "")
-    poses = {}
-    for frame in known & {*links, _EGO_FRAMES[1]}:
-        at, pose = climbed(frame, ego)
-        if at in (ego, root):
-            poses[frame] = pose if at == ego else np.asarray(np.linalg.solve(ego2root, pose), np.float64)
-    if not ego:
-        got = ", ".join(sorted({parent for parent, _ in links.values()})) or "no transforms"
+    parents = {parent for parent, _ in links.values()}
+    ego = next((frame for frame in _EGO_FRAMES if frame in links.keys() | parents), None)
+    if ego is None:
+        got = ", ".join(sorted(parents)) or "no transforms"
         expected = f"{' or '.join(_EGO_FRAMES)}: x forward, y left, z up"
         raise CalibrationError(f"{TF}: which frame is the ego frame? Expected {expected}; got {got}: rename it there")
-    return poses
+    root, ego2root = to_root(ego)
+    poses = {frame: to_root(frame) for frame in links.keys() | parents & {_FOOTPRINT} if root not in links}
+    root2ego = np.asarray(np.linalg.inv(ego2root), np.float64)
+    return {frame: root2ego @ pose for frame, (top, pose) in poses.items() if top == root}
 
 
 def _node_data(node: ElementTree.Element) -> Any:
@@ -242,7 +234,7 @@ class Format(NamedTuple):
     keys: str  # by which a file is recognised, for errors
     convention: str  # assumed on reading, for ``inspect``
     read: Callable[[Path, Mounting], list[Camera]]
-    road_z_m: Callable[[Path], float] = lambda folder: 0.0  # in the ego frame, where mounting.yaml says no other height
+    road_z_m: float = 0.0  # in the ego frame, where neither mounting.yaml nor tf says another height
 
 
 FORMATS = {
@@ -255,7 +247,7 @@ FORMATS = {
     "argoverse2": Format(
         "Argoverse 2", ("intrinsics.feather", "calibration/intrinsics.feather"), "intrinsics.feather",
         "images are published undistorted, k1 to k3 are not used; ego origin at the rear axle, 0.33 m over the road",
-        rig_files.read_argoverse2, lambda folder: -0.33,
+        rig_files.read_argoverse2, -0.33,
     ),
     "nuscenes": Format(
         "nuScenes", (rig_files.CALIBRATED_SENSOR,), "calibrated_sensor.json with sensor.json",
@@ -273,7 +265,7 @@ FORMATS = {
         "K and D of the raw image, not P; coefficients k1 k2 p1 p2 ..., or k1 to k4 of a fisheye where the file says "
         f"so; optical frames (x right, y down, z forward) below base_link in {TF}, the road at base_footprint if it is "
         f"there, or poses from {MOUNTING}",
-        read_camera_files, ros_road_z_m,
+        read_camera_files,
     ),
     "woodscape": Format(
         "WoodScape", (), "intrinsic with model radial_poly",
@@ -332,9 +324,12 @@ def read_calibration(path: Path, where: str) -> Any:
             cameras = form.read(path, mounting)
             if is_folder:  # next to a single file, it may name other files' cameras
                 mounting.check([camera.name for camera in cameras])
-        ground, source = mounting.ground_z_m, f"from {MOUNTING}"
-        if ground is None:
-            ground, source = form.road_z_m(folder), "by default"
+        foot = _frames(folder).get(_FOOTPRINT) if form.read is read_camera_files else None
+        ground, source = form.road_z_m, "by default"
+        if mounting.ground_z_m is not None:
+            ground, source = mounting.ground_z_m, f"from {MOUNTING}"
+        elif foot is not None:
+            ground, source = round(float(foot[2, 3]), 6) + 0.0, f"from {_FOOTPRINT} in {TF}"  # not -0.0
         cameras = mounting.named(cameras)
     except ArbiviewError as error:
         raise type(error)(f"{where}: {form.tool}: {error}") from None

@@ -92,7 +92,7 @@ class Mounting:
             if not isinstance(data[key], Mapping):
                 raise CalibrationError(f"{MOUNTING}: {key}: expected values by camera, got {shown(data[key])}")
             data[key] = {str(name): value for name, value in data[key].items()}
-        poses = {name: pose_of(name, value) for name, value in data.get("poses", {}).items()}
+        poses = {name: pose_of(f"camera {name!r}", value) for name, value in data.get("poses", {}).items()}
         scale = data.get("metres_per_unit")
         if scale is not None and not (type(scale) in (int, float) and 0 < scale < math.inf):
             raise CalibrationError(f"{MOUNTING}: metres_per_unit: expected a positive number, got {shown(scale)}")
@@ -144,9 +144,8 @@ class Mounting:
         return {name: to_ego @ pose for name, pose in relative.items()}
 
 
-def pose_of(name: str, value: Any) -> FloatArray:
+def pose_of(where: str, value: Any, field: str = "pose") -> FloatArray:
     """(4, 4) pose of a matrix, or of tf's translation x y z and quaternion x y z w, which are mappings or lists."""
-    where = f"camera {name!r}"
     if isinstance(value, Mapping):
         expected = "a 4x4 matrix, or {translation: {x, y, z}, rotation: {x, y, z, w}} or their lists [x, y, z, w]"
         try:
@@ -155,8 +154,8 @@ def pose_of(name: str, value: Any) -> FloatArray:
                 for part, axes in ((value["translation"], "xyz"), (value["rotation"], "xyzw"))
             )
         except (LookupError, TypeError, ValueError):
-            raise refusal(name, expected, shown(value), key="pose") from None
+            raise validation.refusal(where, field, expected, shown(value)) from None
         numbers = [*position, w, x, y, z]
         expected = "three finite numbers, and four of a quaternion that are not all 0"
-        value = poses_from(checked_array(where, "pose", numbers, (7,), expected, lambda numbers: numbers[3:].any()))
-    return checked_pose(where, value, "pose")
+        value = poses_from(checked_array(where, field, numbers, (7,), expected, lambda numbers: numbers[3:].any()))
+    return checked_pose(where, value, field)

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -48,10 +48,9 @@ _NOT_READ = {
 _COLMAP_FILES, _MOST_MODEL_BYTES = ("cameras", "images"), 1 << 28  # images with their points
 
 
-class _Image(NamedTuple):
-    name: str
-    camera: int
-    pose: FloatArray  # (4, 4) camera to world, in the reconstruction's units
+_Model = tuple[dict[int, tuple[Any, ...]], list[tuple[str, int, list[float]]]]
+"""Model, width, height and parameters of cameras by number; file, number of the camera, and quaternion w x y z and
+translation, world to camera, of each image."""
 
 
 def read_colmap(path: Path, mounting: Mounting) -> list[Camera]:
@@ -62,14 +61,14 @@ def read_colmap(path: Path, mounting: Mounting) -> list[Camera]:
     folder = path if path.is_dir() else path.parent
     end = path.suffix if path.is_file() else ".bin" if (folder / "images.bin").is_file() else ".txt"
     models, images = (_binary_model if end == ".bin" else _text_model)(folder)
-    by_file, chosen = {image.name: image for image in images}, mounting.images
+    by_file, chosen = {file: (camera, numbers) for file, camera, numbers in images}, mounting.images
     if len(by_file) < len(images):
-        (file, times), *_ = Counter(image.name for image in images).most_common(1)
+        (file, times), *_ = Counter(file for file, _, _ in images).most_common(1)
         raise CalibrationError(f"images{end}: expected images with different names, got {shown(file)} {times} times")
     example = next(iter(by_file), "")
     if not chosen:
         fix = f"write one for each camera to {MOUNTING} beside the files: images: {{front: {example}, ...}}"
-        for camera, times in Counter(image.camera for image in images).items():
+        for camera, times in Counter(camera for _, camera, _ in images).items():
             if times > 1:
                 raise CalibrationError(f"camera {camera} has {times} images: which were taken at one moment? {fix}")
         names = [os.path.dirname(file) or Path(file).stem for file in by_file]
@@ -87,8 +86,10 @@ def read_colmap(path: Path, mounting: Mounting) -> list[Camera]:
         raise CalibrationError(f"how many metres is a unit of the reconstruction? {fix}")
     scale = np.ones((4, 4))
     scale[:3, 3] = mounting.metres_per_unit
-    poses = mounting.mounted({name: by_file[file].pose * scale for name, file in chosen.items()})
-    return [_camera(name, models[by_file[chosen[name]].camera], cam2ego) for name, cam2ego in poses.items()]
+    numbers = np.array([by_file[file][1] for file in chosen.values()])
+    relative = np.linalg.inv(poses_from(numbers[:, [4, 5, 6, 0, 1, 2, 3]])) * scale
+    poses = mounting.mounted(dict(zip(chosen, relative, strict=True)))
+    return [_camera(name, models[by_file[chosen[name]][0]], cam2ego) for name, cam2ego in poses.items()]
 
 
 def _camera(name: str, camera: tuple[Any, ...], cam2ego: FloatArray) -> Camera:
@@ -111,8 +112,7 @@ def _model(key: int | str) -> tuple[int, str, int, int, str]:
     raise CalibrationError(f"camera model: expected {', '.join(model[1] for model in _MODELS)}, got {got}")
 
 
-def _text_model(folder: Path) -> tuple[dict[int, tuple[Any, ...]], list[_Image]]:
-    """Model, width, height and parameters of cameras by number, and images."""
+def _text_model(folder: Path) -> _Model:
     texts = (read_calibration_text(folder / f"{name}.txt", f"{name}.txt", _MOST_MODEL_BYTES) for name in _COLMAP_FILES)
     cameras, images = ([line for line in text.splitlines() if not line.startswith("#")] for text in texts)
     models = {}
@@ -123,10 +123,10 @@ def _text_model(folder: Path) -> tuple[dict[int, tuple[Any, ...]], list[_Image]]
             expected = "two lines for each image, the second with its points or empty"
             raise CalibrationError(f"images.txt: expected {expected}, got {shown(points)}")
     rows = (line.split(maxsplit=9) for line in filter(str.strip, images[::2]))
-    return models, [_image(name, int(camera), list(map(float, numbers))) for _, *numbers, camera, name in rows]
+    return models, [(name, int(camera), list(map(float, numbers))) for _, *numbers, camera, name in rows]
 
 
-def _binary_model(folder: Path) -> tuple[dict[int, tuple[Any, ...]], list[_Image]]:
+def _binary_model(folder: Path) -> _Model:
     cameras, images = (read_bytes(folder / f"{name}.bin", _MOST_MODEL_BYTES) for name in _COLMAP_FILES)
     models, at = {}, 8
     for _ in range(struct.unpack_from("<Q", cameras)[0]):
@@ -138,14 +138,9 @@ def _binary_model(folder: Path) -> tuple[dict[int, tuple[Any, ...]], list[_Image
     for _ in range(struct.unpack_from("<Q", images)[0]):
         _, *numbers, number = struct.unpack_from("<i7di", images, at)
         end = images.index(b"\0", at + 64)
-        found.append(_image(images[at + 64 : end].decode(), number, numbers))
+        found.append((images[at + 64 : end].decode(), number, numbers))
         at = end + 9 + 24 * struct.unpack_from("<Q", images, end + 1)[0]  # x, y and a number of each point
     return models, found
-
-
-def _image(name: str, camera: int, numbers: list[float]) -> _Image:
-    """An image of a quaternion w x y z and a translation, world to camera."""
-    return _Image(name, camera, np.linalg.inv(poses_from([*numbers[4:], *numbers[:4]])))  # type: ignore[arg-type]
 
 
 # --- Kalibr

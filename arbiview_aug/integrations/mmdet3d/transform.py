@@ -17,8 +17,8 @@ from arbiview_aug import CalibrationError, RandomRig, Rig, RigRetarget, SampleEr
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.random_rig import Epochs, names_in, sequence_rng
 from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
+from arbiview_aug.cameras.validation import checked_array
 from arbiview_aug.choices import is_number
-from arbiview_aug.errors import shown
 from arbiview_aug.integrations.mmdet3d.matrices import ResultCameras, padded, upper_triangular
 from arbiview_aug.integrations.mmdet3d.results import (
     check_no_lenses,
@@ -93,7 +93,9 @@ class RigRetargetMultiView:
         self.names = rig.names
         self.lidar2ego = lidar2ego
         self.ground_z_m = float(ground_z_m)
-        self.img_norm = checked_norm(img_norm)
+        expected = "three means and three positive stds"
+        norm = checked_array("", "img_norm", img_norm, (2, 3), expected, lambda numbers: (numbers[1] > 0).all())
+        self.img_norm = tuple(norm.tolist())
         by_target = chosen.sequence_key if isinstance(chosen, RandomRig) and chosen.per == "sequence" else None
         self.sequence_key = sequence_key or by_target
         self._epochs = chosen if isinstance(chosen, RandomRig) else Epochs()
@@ -291,18 +293,6 @@ def _infos(target: ResultCameras, key2global: FloatArray) -> dict[str, dict[str,
 
 
 # --- grey levels ------------------------------------------------------------------------------------------------------
-def checked_norm(norm: Any) -> Norm:
-    """Three means and three standard deviations above 0; SampleError for anything else."""
-    try:
-        mean, std = (np.asarray(numbers, np.float64).ravel().tolist() for numbers in norm)
-        valid = len(mean) == len(std) == 3 and min(std) > 0
-    except (TypeError, ValueError):
-        valid = False
-    if not valid:
-        raise SampleError(f"img_norm: expected three means and three positive stds, got {shown(norm)}")
-    return mean, std
-
-
 def levels(images: torch.Tensor, norm: Norm) -> torch.Tensor:
     """Normalised images (..., 3, h, w) as uint8; SampleError for what was not 8 bit images normalised so."""
     mean, std = (torch.tensor(numbers, dtype=torch.float64)[:, None, None] for numbers in norm)
