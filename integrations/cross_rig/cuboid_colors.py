@@ -20,12 +20,10 @@ from arbiview_aug.datasets.synthetic.materials import (
     octave,
     pulses,
 )
-from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, SKY_ID
 from arbiview_aug.datasets.synthetic.render import Renderer
-from arbiview_aug.datasets.synthetic.scene import BOX, Material, Scene
+from arbiview_aug.datasets.synthetic.scene import BOX, GROUND_ID, Material, Scene
 from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables, sample_light
 
-_CHUNK = 32768  # hits shaded at a time: temporaries stay in the cache
 _SUN, _SHADE = (1.25, 1.02, 0.74), (0.66, 0.70, 0.80)  # warm light, cool ambient
 
 
@@ -35,30 +33,13 @@ class Wall(IntEnum):
     BRICK, PLASTER, STRIPES, PANELS = range(4)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CuboidScene(Scene):
     """As ``Scene``, with the looks of this world."""
 
     cobbled: bool  # the road is of stones; otherwise of concrete
     lined: bool  # the road has yellow lines
     haze_m: float  # distance at which 63 % of the light is the air's
-
-
-def shade(tables: SceneTables, hits: Hits, face: Tensor) -> Tensor:
-    """(n, 3) colours of hits on box sides ``face`` (n,), as ``shading.shade`` gives them."""
-    out = torch.zeros_like(hits.point)
-    material = torch.where(hits.primitive >= 0, tables.material[hits.primitive.clamp_min(0)], hits.primitive)
-    for m in material.unique().tolist():
-        for rows in (material == m).nonzero()[:, 0].split(_CHUNK):
-            part = Hits(*(array[rows] for array in hits))
-            out[rows] = _sky(tables.scene, part) if m == SKY_ID else _lit(tables, part, face[rows], m)
-    return out.clamp(0, 1)
-
-
-class CuboidRenderer(Renderer):
-    """Renders scenes in these colours."""
-
-    shade = staticmethod(shade)
 
 
 def _lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor:
@@ -212,3 +193,9 @@ _COLORS: dict[int, Callable[[Surface], Tensor]] = {
     GROUND_ID: _road, Material.FACADE: _facade, Material.PAINT: _paint, Material.GLASSHOUSE: _glasshouse,
     Material.SLAB: _slab, Material.ROUGH: _rough, Material.LEAF: _leaf, Material.PLAIN: lambda s: s.color,
 }  # fmt: skip
+
+
+class CuboidRenderer(Renderer):
+    """Renders scenes in these colours."""
+
+    lit, sky = staticmethod(_lit), staticmethod(_sky)

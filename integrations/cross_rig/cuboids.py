@@ -149,7 +149,7 @@ class _World:
     """A scene under construction."""
 
     def __init__(self, rng: np.random.Generator, street: Street, ego2street: np.ndarray) -> None:
-        self.rng, self.street, self.builder = rng, street, SceneBuilder()
+        self.rng, self.street, self.builder = rng, street, SceneBuilder(rng)
         ego = np.stack([np.linspace(-1.5, 5, 5), np.zeros(5), np.zeros(5), np.ones(5)])
         self.taken = np.column_stack([(ego2street @ ego)[:2].T, np.full(5, 1.9)])  # discs: x, y, radius
 
@@ -173,7 +173,7 @@ class _World:
         self, x: Range, y: Range, z: Range, cls: SceneClass, look: Look, taper: tuple[float, ...] = (0,) * 4
     ) -> None:
         """A cuboid along the street."""
-        place = self.builder.place((0.0, 0.0, 0.0), 0.0, cls)
+        place = self.builder.place(cls)
         place.box(x, (min(y), max(y)), z, look, taper=taper)  # type: ignore[arg-type]
 
     def add_land(self) -> None:
@@ -259,12 +259,11 @@ class _World:
         kinds = _KINDS[:4] if short else _KINDS
         shares = np.array([kind.share for kind in kinds])
         kind = kinds[int(rng.choice(len(kinds), p=shares / shares.sum()))]
-        size = length, width, height = rng.uniform(*kind.length), rng.uniform(*kind.width), rng.uniform(*kind.height)
+        size = length, width, _ = rng.uniform(*kind.length), rng.uniform(*kind.width), rng.uniform(*kind.height)
         yaw += rng.normal(0, short / 2)
         if not self.claim(x, y, length, width, yaw):
             return
-        row = self.builder.add_box(np.array([x, y, z + height / 2]), size, yaw, kind.cls)
-        place = self.builder.place((x, y, z), yaw, SceneClass.VEHICLE, row)
+        place = self.builder.place(SceneClass.VEHICLE, (x, y, z), yaw, (kind.cls, size))
         _add_body(place, kind, size, self.color, rng)
 
     def add_people(self) -> None:
@@ -275,9 +274,8 @@ class _World:
             if not self.claim(x, y, width, width, 0.0):
                 continue
             base, yaw = self.street.kerb_m, float(rng.choice([0, math.pi]))
-            centre = np.array([x, y, base + height / 2])
-            row = self.builder.add_box(centre, (0.3, width, height), yaw, BoxClass.PEDESTRIAN)
-            place = self.builder.place((x, y, base), yaw, SceneClass.PEDESTRIAN, row)
+            label = BoxClass.PEDESTRIAN, (0.3, width, height)
+            place = self.builder.place(SceneClass.PEDESTRIAN, (x, y, base), yaw, label)
             hip, neck, half = 0.48 * height, height - 0.27, width / 2
             place.box((-0.15, 0.15), (-half * 0.8, half * 0.8), (0, hip), _plain(self.color(_CLOTHES)))
             place.box((-0.13, 0.13), (-half, half), (hip, neck), _plain(self.color(_CLOTHES)))
@@ -285,7 +283,7 @@ class _World:
 
     def add_post(self, x: float, y: float) -> None:
         height, grey = self.rng.uniform(2.5, 6), self.rng.uniform(0.1, 0.5)
-        place = self.builder.place((x, y, 0.0), 0.0, SceneClass.POLE)
+        place = self.builder.place(SceneClass.POLE, (x, y, 0.0))
         place.box((-0.07, 0.07), (-0.07, 0.07), (0, height), _plain((grey, grey, grey * 0.9)))
         place.box((-0.25, 0.25), (-0.25, 0.25), (height, height + 0.35), _plain((0.85, 0.80, 0.62)))
 
@@ -295,7 +293,7 @@ class _World:
         height, spread = rng.uniform(3, 8), rng.uniform(0.5, 1.6)
         if not self.claim(x, y, 2 * spread, 2 * spread, 0.0):
             return
-        place = self.builder.place((x, y, 0.0), 0.0, SceneClass.VEGETATION)
+        place = self.builder.place(SceneClass.VEGETATION, (x, y, 0.0))
         fork = height * rng.uniform(0.2, 0.4)
         place.box((-0.12, 0.12), (-0.12, 0.12), (0, fork * 1.3), _plain((0.24, 0.18, 0.13)))
         crown = self.color(((0.16, 0.26, 0.16), (0.42, 0.34, 0.12), (0.24, 0.34, 0.14)), 0.03)

@@ -188,7 +188,8 @@ class Source:
         rig, drive = self.rig, self._own_drive
         scene, views = drive.scene(index), drive.render(index)
         boxes = scene.boxes_ego(rig.ground_z_m)
-        pixels = views.visible_pixels(len(boxes)).numpy().max(0)  # of the camera that shows most of an object
+        counts = [np.bincount(view.flatten() + 1, minlength=len(boxes) + 1)[1:] for view in views.instances]
+        pixels = np.max(counts, 0)  # of the camera that shows most of an object
         labels = labels_of(Grid(), boxes, scene.box_classes, pixels >= max(1.0, VISIBLE_SHARE * math.prod(self.size)))
         calibration = {"K": rig.K.astype(np.float32), "cam2ego": rig.cam2ego.astype(np.float32)}
         assert isinstance(views.images, torch.Tensor)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache, partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,17 +18,11 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import is_whole
 from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours, checked_index
-from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
-from arbiview_aug.datasets.synthetic.render import Renderer, small_steps
-from arbiview_aug.datasets.synthetic.scene import FloatArray, IntArray, Material, Scene, SceneClass
+from arbiview_aug.datasets.synthetic.render import Renderer, cast, find_candidates, scene_from, small_steps
+from arbiview_aug.datasets.synthetic.scene import GROUND_ID, FloatArray, IntArray, Material, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 from arbiview_aug.sample.batching import stacked
 
-LIDAR_POSITION_M = (0.9, 0.0, 1.9)  # ego x, y and height over the road: on the roof, as on nuScenes' vehicles
-LIDAR_BEAMS_DEG = (-30.67, 10.67)  # elevations of the lowest and the highest of 32 beams (Velodyne HDL-32E)
-LIDAR_COLUMNS = 1088
-LIDAR_RANGE_M = (1.0, 90.0)
-_BEAMS = 32
 NOISE_M = 0.02  # one sigma of the range
 
 Rays = npt.NDArray[np.float32] | FloatArray
@@ -50,11 +45,6 @@ class RenderedViews(NamedTuple):
     depth_m: Tensor | list[Tensor]
     classes: Tensor | list[Tensor]
     instances: Tensor | list[Tensor]
-
-    def visible_pixels(self, num_boxes: int) -> Tensor:
-        """(N, num_boxes) int64 number of pixels of each camera that show each box's object."""
-        counts = [torch.bincount(view.flatten().long() + 1, minlength=num_boxes + 1) for view in self.instances]
-        return torch.stack(counts)[:, 1:]
 
 
 class SyntheticDrive(Dataset[dict[str, Any]]):
@@ -114,18 +104,15 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
             sample["points"] = self.points(index)
         if self.neighbours is not None:
             sample |= {"ego2world": self._ego2world(scene), "time_s": 0.0}
-            steps = [sign * k for sign in self.neighbours.signs for k in range(1, self.neighbours.count + 1)]
-            moments = [step * self.neighbours.step_m / scene.speed_mps for step in steps]
-            noise = [(self.seed, index, 2 + k) for k in range(len(moments))]
-            near = [(scene.after(s), s, sample["token"], seed) for s, seed in zip(moments, noise, strict=True)]
-            sample["neighbours"] = [self._neighbour(*frame) for frame in near]
+            sample["neighbours"], near = [], product(self.neighbours.signs, range(1, self.neighbours.count + 1))
+            for k, (sign, step) in enumerate(near):
+                seconds = sign * step * self.neighbours.step_m / scene.speed_mps
+                then, token = scene.after(seconds), f"{sample['token']}{seconds:+.3f}s"
+                fields = {"rig": self.rig, "boxes_3d": self._boxes(then), "token": token}
+                fields |= {"ego2world": self._ego2world(then), "time_s": seconds}
+                points = partial(self._points, then, (self.seed, index, 2 + k), self.rig) if self.lidar else None
+                sample["neighbours"].append(LazyFrame(fields, partial(self._images, then), points))
         return sample
-
-    def _neighbour(self, scene: Scene, seconds: float, token: str, noise: tuple[int, ...]) -> LazyFrame:
-        fields = {"rig": self.rig, "boxes_3d": self._boxes(scene), "token": f"{token}{seconds:+.3f}s"}
-        fields |= {"ego2world": self._ego2world(scene), "time_s": seconds}
-        points = partial(self._points, scene, noise) if self.lidar else None
-        return LazyFrame(fields, partial(self._images, scene), points)
 
     def _images(self, scene: Scene) -> Tensor | list[Tensor]:
         views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
@@ -158,19 +145,19 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         IndexError past the end, TypeError if ``rig`` is not a ``Rig``.
         """
         index = checked_index(index, len(self))
-        return self._points(self.scene(index), (self.seed, index, 1), None if rig is None else _checked_rig(rig))
+        rig = self.rig if rig is None else _checked_rig(rig)
+        return self._points(self.scene(index), (self.seed, index, 1), rig)
 
-    def _points(self, scene: Scene, noise: tuple[int, ...], rig: Rig | None = None) -> Tensor:
+    def _points(self, scene: Scene, noise: tuple[int, ...], rig: Rig) -> Tensor:
         """Points (P, 4) of a scene, with the noise of a seed."""
-        rig = self.rig if rig is None else rig
         road = np.array([0.0, 0.0, rig.ground_z_m])
         scanners = [(lidar.center_m - road, lidar.rays.T, lidar.range_m) for lidar in rig.lidars]
         if not scanners:
-            elevation = np.radians(np.linspace(*LIDAR_BEAMS_DEG, _BEAMS))
-            azimuth = np.linspace(0, 2 * math.pi, LIDAR_COLUMNS, endpoint=False)
+            # On the roof, as on nuScenes' vehicles, are 32 beams of 1,088 columns (Velodyne HDL-32E).
+            elevation, azimuth = np.radians(np.linspace(-30.67, 10.67, 32)), np.linspace(0, 2 * math.pi, 1089)[:-1]
             el, az = np.meshgrid(elevation, azimuth, indexing="xy")
             rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], -1)
-            scanners = [(np.array(LIDAR_POSITION_M), rays, LIDAR_RANGE_M)]
+            scanners = [(np.array([0.9, 0.0, 1.9]), rays, (1.0, 90.0))]
         seeds = [(*noise, k) if k else noise for k in range(len(scanners))]
         scans = [self._scan(scene, *scanner, seed) for scanner, seed in zip(scanners, seeds, strict=True)]
         points = np.concatenate(scans)

@@ -50,10 +50,8 @@ def cast_packets(local: Any, rays: Any, ends: Any, primitives: Any, halves: Any,
             if not distance[p] < nearest.max():
                 continue
             if is_box[p]:
-                for i in range(size):
-                    enter[i] = -_INF
-                for i in range(size):
-                    leave[i] = _INF
+                enter[:] = -_INF
+                leave[:] = _INF
                 for k in range(6):
                     nx, ny, nz, offset = normals[p, k, 0], normals[p, k, 1], normals[p, k, 2], offsets[p, k]
                     for i in range(size):

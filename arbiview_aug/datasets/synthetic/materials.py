@@ -1,4 +1,4 @@
-"""Albedo of buildings, vehicles and furniture: one function per material.
+"""Albedo of the road and of everything on it: one function per material.
 
 Each takes hits on one material and returns (n, 3) display RGB before light and haze, filtered over the footprint.
 
@@ -8,13 +8,14 @@ share of the footprint; noise loses each octave as the footprint reaches its wav
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from arbiview_aug.datasets.synthetic.scene import Material, Scene
+from arbiview_aug.datasets.synthetic.scene import GROUND_ID, Material, Scene, Street
 
 _A, _B, _C = 374761393, 668265263, 1274126177  # odd 31-bit multipliers, as in common integer lattice hashes
 
@@ -289,8 +290,146 @@ def _leaf(s: Surface) -> Tensor:
     return s.color * (tone.clamp(0.25, 2.2) * depth)[:, None]
 
 
-MATERIALS: dict[Material, Callable[[Surface], Tensor]] = {
-    Material.FACADE: _facade, Material.PAINT: _paint, Material.GLASSHOUSE: _glasshouse, Material.COACH: _coach,
-    Material.PLAIN: lambda s: s.color, Material.WHEEL: _wheel, Material.SIGN: _sign, Material.LEAF: _leaf,
-    Material.ROUGH: _rough,
+def _along_axes(s: Surface) -> tuple[Tensor, Tensor]:
+    """Footprints (n,) along the street's x and y, of the road plane."""
+    x2, y2 = s.direction[:, 0] ** 2, s.direction[:, 1] ** 2
+    flat = (x2 + y2).clamp_min(1e-8)
+    x2, y2 = x2 / flat, y2 / flat
+    return (s.slant**2 * x2 + s.across**2 * y2).sqrt(), (s.slant**2 * y2 + s.across**2 * x2).sqrt()
+
+
+def _road(s: Surface) -> Tensor:
+    """Asphalt with wear and markings."""
+    street, salt, (x, y, _), (fx, fy) = s.scene.street, s.scene.salt, s.point.unbind(1), _along_axes(s)
+    f, wear = torch.maximum(fx, fy), street.wear
+    tone = street.asphalt * (1 + 0.10 * octave(x, y, 7.0, f, salt) + 0.09 * octave(x, y, 1.7, f, salt + 1))
+    # Streaks along the road, polished wheel tracks, a darker oil strip between them.
+    streak = noise(x * (1 / 9.0), y * (1 / 0.45), salt + 2) * fade(torch.maximum(fx * 0.05, fy), 0.45)
+    streak = streak + 0.7 * noise(x * (1 / 4.0), y * (1 / 0.15), salt + 3) * fade(torch.maximum(fx * 0.04, fy), 0.15)
+    lane = y * (1 / street.lane_width_m)
+    across = (lane - lane.floor() - 0.5).abs() * street.lane_width_m
+    track, oil = step(0.45 - (across - 0.8).abs(), 0.0, 0.35), step(0.4 - across, 0.0, 0.4)
+    tone = tone * (1 + 0.07 * streak + 0.05 * track - 0.06 * oil)
+    grain = octave(x, y, 0.30, f, salt + 4) * 0.07 + octave(x, y, 0.11, f, salt + 5) * 0.10
+    grain = grain + octave(x, y, 0.045, f, salt + 6) * 0.16
+    tone = tone * (1 + grain * (0.7 + 0.3 * wear))
+    tone = _patches(street, salt, tone, x, y, fx, fy)
+    # Cracks along the zero crossings of bent noise: an open net of long ones, a fine one in worn places.
+    bend = octave(x, y, 0.5, f, salt + 50) * 0.22
+    for k, (along, apart, width, depth) in enumerate(((4.5, 1.6, 0.016, 0.5), (0.8, 0.5, 0.008, 0.4))):
+        n = noise(x * (1 / along) + bend / along, y * (1 / apart) + bend / apart, salt + 51 + k)
+        distance = n.abs() * (0.45 * apart)  # the noise falls by about 2 over its wavelength
+        line = ((width + f / 2 - distance) / f.clamp_min(width)).clamp(0, 1) * fade(f, apart * 0.5)
+        where = step(noise(x * 0.11, y * 0.16, salt + 55 + k), -0.2 + 0.5 * k, 0.5 + 0.4 * k)
+        thinned = (width / f.clamp_min(width)).clamp(0.25, 1)
+        tone = tone * (1 - depth * min(1.0, wear) * line * where * thinned)
+    # Stains: one in some cells of 2.5 m.
+    i, j = (x * 0.4).floor(), (y * 0.4).floor()
+    h = [cell_hash(i, j, salt + 60 + m) for m in range(4)]
+    dx, dy = x - (i + 0.25 + 0.5 * h[0]) * 2.5, y - (j + 0.25 + 0.5 * h[1]) * 2.5
+    d = (dx * dx + dy * dy).sqrt() / (0.08 + 0.45 * h[2] * h[2]) + 0.35 * octave(x, y, 0.25, f, salt + 64)
+    tone = tone * (1 - 0.30 * step(1 - d, 0.0, 0.6) * (h[3] < 0.45 * wear) * fade(f, 0.8))
+    edge = torch.minimum(y + street.half_width_m[0], street.half_width_m[1] - y)
+    outside = ((x - street.crossing_x_m).abs() > street.crossing_half_m).float()
+    dirt = step(0.55 - edge, 0.0, 0.5) * (0.6 + 0.4 * octave(x, y, 0.5, f, salt + 9)) * outside
+    color = (tone * (1 - 0.28 * dirt))[:, None] * torch.tensor([1.0, 1.0, 1.015])
+    flaking = octave(x, y, 0.35, f, salt + 10) + 0.5 * octave(x, y, 0.08, f, salt + 11)
+    worn = 0.80 - 0.30 * wear * step(flaking, 0.1, 0.9)
+    paint, centre = _markings(street, x, y, fx, fy)
+    white = torch.tensor([0.80, 0.80, 0.78])
+    yellow = torch.tensor([0.80, 0.62, 0.16]) if street.yellow_centre else white
+    return mix(mix(color, white, paint * worn), yellow, centre * worn)
+
+
+def _patches(street: Street, salt: int, tone: Tensor, x: Tensor, y: Tensor, fx: Tensor, fy: Tensor) -> Tensor:
+    """Rectangular repairs with a sealed rim, utility trenches across the road, manhole covers, the lane joint."""
+    width = street.lane_width_m
+    for k, (length, share) in enumerate(((13.0, 0.42), (5.0, 0.22))):
+        i, j = (x / length).floor(), (y / width).floor()
+        h = [cell_hash(i, j, salt + 20 + 8 * k + m) for m in range(5)]
+        there = (h[0] < share * street.wear).float()
+        x0, y0 = (i + 0.05 + 0.4 * h[1]) * length, (j + 0.06 + 0.35 * h[2]) * width
+        x1, y1 = x0 + (0.12 + 0.4 * h[3]) * length, y0 + (0.22 + 0.35 * h[1]) * width
+        inner = band(x, x0, x1, fx) * band(y, y0, y1, fy) * there
+        outer = band(x, x0 - 0.04, x1 + 0.04, fx) * band(y, y0 - 0.04, y1 + 0.04, fy) * there
+        tone = tone * (1 + inner * (0.34 * h[4] - 0.24)) * (1 - 0.40 * (outer - inner))
+    plot = (x * (1 / 19.0)).floor()
+    trench = cell_hash(plot, torch.zeros_like(x), salt + 40)
+    start = (plot + 0.8 * trench) * 19.0
+    tone = tone * (1 - 0.16 * band(x, start, start + 0.5 + trench, fx) * (trench > 0.5))
+    tone = tone * (1 - 0.25 * band(y - (y / width).round() * width, 0.10, 0.125, fy))
+    i, j = (x * (1 / 14.0)).floor(), (y / width).floor()
+    h0, h1 = (cell_hash(i, j, salt + 41 + m) for m in range(2))
+    dx, dy = x - (i + 0.2 + 0.6 * h1) * 14.0, y - (j + 0.5) * width
+    disc = ((0.34 - (dx * dx + dy * dy).sqrt()) / torch.maximum(fx, fy).clamp_min(0.01) + 0.5).clamp(0, 1)
+    return tone * (1 - 0.35 * disc * (h0 < 0.4) * fade(torch.maximum(fx, fy), 0.9))
+
+
+def _markings(street: Street, x: Tensor, y: Tensor, fx: Tensor, fy: Tensor) -> tuple[Tensor, Tensor]:
+    """Coverage by white paint and by the centre line's paint."""
+    dashes = pulses(x, 9.0, 3.0, fx)
+    centre = band(y.abs(), 0.08, 0.20, fy) if street.solid_centre else band(y, -0.07, 0.07, fy) * dashes
+    edge = street.lanes * street.lane_width_m
+    paint = torch.zeros_like(x)
+    for side in (-1, 1):
+        if street.parking[side > 0]:
+            paint = paint + band(y, side * edge - 0.06, side * edge + 0.06, fy)
+            # bays for parking, marked by short lines
+            bay = sorted((side * edge, side * (edge + 2.0)))
+            paint = paint + band(y, bay[0], bay[1], fy) * pulses(x, 6.0, 0.10, fx)
+        for k in range(1, street.lanes):
+            line = side * k * street.lane_width_m
+            paint = paint + band(y, line - 0.06, line + 0.06, fy) * dashes
+    if math.isinf(street.crossing_x_m):
+        return paint.clamp(0, 1), centre
+    half, along = street.crossing_half_m, x - street.crossing_x_m
+    margin = 5.2 if street.zebra else 1.2
+    outside = 1 - band(along, -half - margin, half + margin, fx)
+    paint, centre = paint * outside, centre * outside
+    right, left = street.half_width_m
+    stop = band(along, -half - margin - 0.4, -half - margin, fx) * band(y, -edge, -0.2, fy)
+    stop = stop + band(along, half + margin, half + margin + 0.4, fx) * band(y, 0.2, edge, fy)
+    paint = paint + stop
+    if street.zebra:
+        stripes = pulses(y, 1.0, 0.5, fy) * band(y, -right + 0.3, left - 0.3, fy)
+        paint = paint + stripes * (band(along, -half - 4.2, -half - 1.2, fx) + band(along, half + 1.2, half + 4.2, fx))
+    across = band(along, -0.07, 0.07, fx) * pulses(y, 9.0, 3.0, fy) * (1 - band(y, -right - 4, left + 4, fy))
+    return (paint + across).clamp(0, 1), centre
+
+
+def _slab(s: Surface) -> Tensor:
+    """Kerb stones, grass, paving and yards."""
+    street, salt, (x, y, _), (fx, fy) = s.scene.street, s.scene.salt, s.point.unbind(1), _along_axes(s)
+    f, left = torch.maximum(fx, fy), y > 0
+    widths = torch.tensor([street.half_width_m, street.sidewalk_m, street.verge_m])
+    half_width, sidewalk, verge_width = torch.where(left, widths[:, 1:], widths[:, :1])
+    behind = y.abs() - half_width
+    corner = ((x - street.crossing_x_m).abs() - street.crossing_half_m).clamp(max=1e4)  # infinite without a crossing
+    kerb = torch.maximum(band(behind, -1.0, 0.16, fy), band(corner, -1.0, 0.16, fx))
+    kerb = torch.where(s.face == 4, kerb, 1.0)  # the kerb has a side
+    dark = 1 + 0.10 * octave(x, y, 1.3, f, salt + 70)
+    dark = dark + 0.10 * octave(x, y, 0.2, f, salt + 71) + 0.10 * octave(x, y, 0.06, f, salt + 74)
+    # paving: 0.6 m slabs of slightly different tone with joints
+    i, j = (x * (1 / 0.6)).floor(), (y * (1 / 0.6)).floor()
+    tone = 1 + 0.14 * (cell_hash(i, j, salt + 72) - 0.5) * fade(f, 0.6)
+    joints = torch.maximum(pulses(x, 0.6, 0.02, fx), pulses(y, 0.6, 0.02, fy))
+    color = s.color * (dark * tone * (1 - 0.4 * joints))[:, None]
+    blades = 1 + 0.20 * octave(x, y, 0.9, f, salt + 73)
+    blades = blades + 0.28 * octave(x, y, 0.16, f, salt + 75) + 0.3 * octave(x, y, 0.05, f, salt + 76)
+    grass = torch.tensor([0.25, 0.29, 0.15]) * blades[:, None]
+    away = (corner > 2.6).float()
+    # Yards: some plots are paved, some are lawns.
+    plot = cell_hash((x * (1 / 19.0)).floor(), left, salt + 77) < 0.6
+    lawn = band(behind, sidewalk, 1e4, fy) * away * plot
+    verge = band(behind, 0.16, 0.16 + verge_width, fy) * away
+    color = mix(color, grass, torch.maximum(lawn, verge))
+    stones = torch.maximum(pulses(x, 1.0, 0.015, fx), pulses(y, 1.0, 0.015, fy))
+    stone = torch.tensor([0.60, 0.595, 0.58]) * (dark * (1 - 0.35 * stones))[:, None]
+    return mix(color, stone, kerb)
+
+
+MATERIALS: dict[int, Callable[[Surface], Tensor]] = {
+    GROUND_ID: _road, Material.SLAB: _slab, Material.FACADE: _facade, Material.PAINT: _paint,
+    Material.GLASSHOUSE: _glasshouse, Material.COACH: _coach, Material.PLAIN: lambda s: s.color,
+    Material.WHEEL: _wheel, Material.SIGN: _sign, Material.LEAF: _leaf, Material.ROUGH: _rough,
 }  # fmt: skip

@@ -52,13 +52,10 @@ def plain(color: Color) -> Look:
     return Look(Material.PLAIN, color)
 
 
-def add_vehicle(
-    builder: SceneBuilder, rng: np.random.Generator, cls: BoxClass, size: Vector, xy: Range, yaw: float
-) -> None:
+def add_vehicle(builder: SceneBuilder, cls: BoxClass, size: Vector, xy: Range, yaw: float) -> None:
     """Add a vehicle on the road plane and its box."""
-    length, width, height = size
-    row = builder.add_box(np.array([*xy, height / 2]), size, yaw, cls)
-    place = builder.place((*xy, 0.0), yaw, SceneClass.VEHICLE, row)
+    rng, (length, width, height) = builder.rng, size
+    place = builder.place(SceneClass.VEHICLE, (*xy, 0.0), yaw, (cls, size))
     paint = pick(rng, PAINTS)
     x, y = length / 2, width / 2 - 0.02  # wheels stand out by 2 cm and give the width
     radius = min(0.25 + 0.05 * height, 0.48)
@@ -90,13 +87,11 @@ def add_vehicle(
         place.cylinder(center, (radius, radius), 0.11, Look(Material.WHEEL, TIRE), lateral=True)
 
 
-def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
+def add_pedestrian(builder: SceneBuilder, xyz: Vector, yaw: float) -> None:
     """Add a standing or walking person and their box."""
-    height = rng.uniform(1.5, 1.92)
-    length, width = rng.uniform(0.34, 0.52), rng.uniform(0.46, 0.60)
-    center = np.array([xyz[0], xyz[1], xyz[2] + height / 2])
-    row = builder.add_box(center, (length, width, height), yaw, BoxClass.PEDESTRIAN)
-    place = builder.place(xyz, yaw, SceneClass.PEDESTRIAN, row)
+    rng = builder.rng
+    height, length, width = (rng.uniform(*ends) for ends in ((1.5, 1.92), (0.34, 0.52), (0.46, 0.60)))
+    place = builder.place(SceneClass.PEDESTRIAN, xyz, yaw, (BoxClass.PEDESTRIAN, (length, width, height)))
     trousers, jacket = pick(rng, _TROUSERS), pick(rng, _CLOTHES)
     skin = pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
     sleeve: Color = (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85)
@@ -116,9 +111,10 @@ def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector,
     place.ellipsoid((0, 0, height - 0.115), (0.10, 0.085, 0.115), plain(skin))
 
 
-def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, reach_m: float = math.inf) -> None:
+def add_tree(builder: SceneBuilder, xyz: Vector, *, reach_m: float = math.inf) -> None:
     """Trunk and a crown of several ellipsoids, which reaches out at most ``reach_m`` from the trunk."""
-    place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
+    rng = builder.rng
+    place = builder.place(SceneClass.VEGETATION, xyz, rng.uniform(0, 6.28))
     height, trunk = rng.uniform(4.5, 10), rng.uniform(0.09, 0.22)
     fork = height * rng.uniform(0.35, 0.5)
     bark = pick(rng, ((0.30, 0.25, 0.20), (0.36, 0.33, 0.29)), 0.03)
@@ -135,9 +131,10 @@ def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, re
         place.ellipsoid((out * np.cos(turn), out * np.sin(turn), z), radii, Look(Material.LEAF, green))
 
 
-def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, scale: float = 1.0) -> None:
+def add_bush(builder: SceneBuilder, xyz: Vector, *, scale: float = 1.0) -> None:
     """Add low ellipsoids of leaves."""
-    place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
+    rng = builder.rng
+    place = builder.place(SceneClass.VEGETATION, xyz, rng.uniform(0, 6.28))
     green = pick(rng, ((0.20, 0.28, 0.13), (0.26, 0.30, 0.15)), 0.02)
     for _ in range(4):
         x, y = rng.normal(0, 0.4 * scale, 2)
@@ -145,11 +142,9 @@ def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, sc
         place.ellipsoid((float(x), float(y), height * 0.6), (r, r * 0.9, height), Look(Material.LEAF, green))
 
 
-def add_building(
-    builder: SceneBuilder, rng: np.random.Generator, x: Range, y: Range, z: Range, *, detailed: bool = True
-) -> None:
+def add_building(builder: SceneBuilder, x: Range, y: Range, z: Range, *, detailed: bool = True) -> None:
     """A block with windows; detailed ones have a cornice, now and then bays or an awning over the ground floor."""
-    place, (base_m, height) = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING), z
+    rng, place, (base_m, height) = builder.rng, builder.place(SceneClass.BUILDING), z
     wall = pick(rng, WALLS)
     bay, storey = rng.uniform(2.2, 4.2), rng.uniform(2.9, 3.6)
     # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
@@ -157,11 +152,10 @@ def add_building(
     place.box(x, y, (base_m - 0.05, height), Look(Material.FACADE, wall, param))
     if not detailed:
         return
-    trim: Color = (wall[0] * 0.8, wall[1] * 0.8, wall[2] * 0.8)
-    cornice = (x[0] - 0.25, x[1] + 0.25), (y[0] - 0.25, y[1] + 0.25), (height, height + 0.4)
-    place.box(*cornice, Look(Material.ROUGH, trim, (0.8, 0.08, 0, 0)))
+    trim = Look(Material.ROUGH, (wall[0] * 0.8, wall[1] * 0.8, wall[2] * 0.8), (0.8, 0.08, 0, 0))
+    place.box((x[0] - 0.25, x[1] + 0.25), (y[0] - 0.25, y[1] + 0.25), (height, height + 0.4), trim)
     front, outward = (y[0], -1.0) if y[0] > 0 else (y[1], 1.0)
-    if param[3] and rng.random() < 0.6:
+    if param[3] and rng.random() < 0.6:  # an awning
         cloth = pick(rng, _CLOTHES)
         a = rng.uniform(x[0] + 0.3, (x[0] + x[1]) / 2)
         b = min(a + rng.uniform(3, 7), x[1] - 0.2)

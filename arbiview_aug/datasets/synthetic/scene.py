@@ -44,12 +44,13 @@ class BoxClass(IntEnum):
 
 
 class Material(IntEnum):
-    """Materials: one function of ``shading`` each."""
+    """Materials: one function of ``materials`` each."""
 
-    ROAD, SLAB, FACADE, PAINT, GLASSHOUSE, COACH, PLAIN, WHEEL, SIGN, LEAF, ROUGH = range(11)
+    SLAB, FACADE, PAINT, GLASSHOUSE, COACH, PLAIN, WHEEL, SIGN, LEAF, ROUGH = range(1, 11)
 
 
 BOX, ELLIPSOID, CYLINDER = 0, 1, 2
+SKY_ID, GROUND_ID = -1, -2  # in place of the row of a primitive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +84,7 @@ class Light:
     clouds: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
     """One street scene; P primitives and B labelled boxes in the street frame."""
 
@@ -112,9 +113,6 @@ class Scene:
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)  # drives share their streets
 
-    def __len__(self) -> int:
-        return len(self.kind)
-
     def boxes_ego(self, ground_z_m: float) -> FloatArray:
         """(B, 7) boxes in the ego frame whose road lies at ``ground_z_m``."""
         R, origin = self.ego2street[:3, :3], self.ego2street[:3, 3]
@@ -138,28 +136,29 @@ class Scene:
         return replace(self, center=center, planes=planes, corners=corners, boxes=boxes, ego2street=ego2street)
 
 
+Label = tuple[BoxClass, Vector]  # of a 3D box: class and size
 _ZEROS = (0.0, 0.0, 0.0, 0.0)
-_NO_TURN, _NO_PLANES = np.eye(3), np.zeros((6, 4))
+_NO_TURN = np.eye(3)
 _SIGNS = np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)], dtype=np.float64)
 
 
 class SceneBuilder:
-    """Collects primitives and boxes; parts are given relative to a placed object."""
+    """Collects primitives and boxes; parts are given relative to a placed object. All objects draw from ``rng``."""
 
-    def __init__(self) -> None:
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
         self.primitives: list[dict[str, Any]] = []
         self.boxes: list[tuple[float, ...]] = []
         self.box_classes: list[int] = []
 
-    def place(self, origin: Vector, yaw: float, cls: SceneClass, instance: int = -1) -> Placed:
-        """A frame to add parts in: origin on the surface below, x forward."""
+    def place(self, cls: SceneClass, origin: Vector = (0, 0, 0), yaw: float = 0, label: Label | None = None) -> Placed:
+        """A frame to add parts in: origin on the surface below, x forward; class and size of its 3D box, if any."""
+        if label is not None:
+            x, y, z = map(float, origin)
+            self.boxes.append((x, y, z + label[1][2] / 2, *label[1], yaw))
+            self.box_classes.append(label[0])
+        instance = -1 if label is None else len(self.boxes) - 1
         return Placed(self, np.array(origin, dtype=np.float64), yaw_matrix(yaw), cls, instance)
-
-    def add_box(self, center: FloatArray, size: Vector, yaw: float, cls: BoxClass) -> int:
-        """Add a 3D label; returns its row."""
-        self.boxes.append((*map(float, center), *size, yaw))
-        self.box_classes.append(cls)
-        return len(self.boxes) - 1
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """The collected rows in ``Scene``'s shapes."""
@@ -205,24 +204,17 @@ class Placed:
 
     def ellipsoid(self, center: Vector, radii: Vector, look: Look) -> None:
         """Add an ellipsoid along the object's axes."""
-        self._add(ELLIPSOID, np.array(center), np.array(radii), look)
+        self._add(ELLIPSOID, center, radii, look)
 
     def cylinder(self, center: Vector, radii: Range, half_length: float, look: Look, *, lateral: bool = False) -> None:
         """Add a capped elliptic cylinder, upright or (wheels) with its axis along the object's y."""
         axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) if lateral else _NO_TURN
-        self._add(CYLINDER, np.array(center), np.array([*radii, half_length]), look, axes=axes)
+        self._add(CYLINDER, center, (*radii, half_length), look, axes)
 
     def _add(
-        self,
-        kind: int,
-        middle: FloatArray,
-        half: FloatArray,
-        look: Look,
-        *,
-        axes: FloatArray = _NO_TURN,
-        corners: FloatArray | None = None,
-        planes: FloatArray = _NO_PLANES,
+        self, kind: int, middle: Any, half: Any, look: Look, axes: Any = _NO_TURN, corners: Any = None, planes: Any = 0
     ) -> None:
+        half, planes = np.array(half), planes + np.zeros((6, 4))
         rotation, center = self.rotation @ axes, self.origin + self.rotation @ middle
         normals = planes[:, :3] @ rotation.T
         row = {"kind": kind, "center": center, "rotation": rotation, "half": half, **look._asdict()}

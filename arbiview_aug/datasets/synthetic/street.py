@@ -43,15 +43,15 @@ def make_scene(seed: int, index: int) -> Scene:
     world.add_buildings()
     world.add_background()
     world.add_parked()
-    parked = len(world.builder.boxes)
+    parked = len(world.boxes)
     world.add_moving()
     world.add_furniture()
     world.add_pedestrians()
     # Traffic in the vehicle's direction keeps about its speed, so that it stays off the place before and behind it.
     motion = np.random.default_rng(np.random.SeedSequence([seed, index, 2]))
     speed_mps = motion.uniform(*_SPEED_MPS)
-    velocities = np.zeros((len(world.builder.boxes), 2))
-    for row, (box, cls) in enumerate(zip(world.builder.boxes, world.builder.box_classes, strict=True)):
+    velocities = np.zeros((len(world.boxes), 2))
+    for row, (box, cls) in enumerate(zip(world.boxes, world.box_classes, strict=True)):
         walks = cls == BoxClass.PEDESTRIAN
         own_mps = motion.uniform(0.8, 1.7) if walks else speed_mps * motion.uniform(0.9, 1.1)
         waits = motion.random() < _WAITING and math.cos(box[6]) < 0.5
@@ -64,7 +64,7 @@ def make_scene(seed: int, index: int) -> Scene:
         street=street,
         light=_light(rng),
         salt=int(rng.integers(1 << 20)),
-        **world.builder.arrays(),
+        **world.arrays(),
     )
 
 
@@ -115,18 +115,16 @@ def _light(rng: np.random.Generator) -> Light:
     )
 
 
-class _World:
+class _World(SceneBuilder):
     """A scene under construction; all methods draw from one generator, in a fixed order."""
 
     def __init__(self, rng: np.random.Generator, street: Street, ego2street: np.ndarray) -> None:
-        self.rng = rng
-        self.street = street
-        self.ego2street = ego2street
-        self.builder = SceneBuilder()
+        super().__init__(rng)
+        self.street, self.ego2street = street, ego2street
         self.taken: list[tuple[float, float, float]] = []  # x, y, radius of vehicles
         x, half = street.crossing_x_m, street.crossing_half_m
         self.blocks = [(-END_M, END_M)] if math.isinf(x) else [(-END_M, x - half), (x + half, END_M)]
-        land = self.builder.place((0, 0, 0), 0.0, SceneClass.SIDEWALK)  # kerb, verge, paving, yards
+        land = self.place(SceneClass.SIDEWALK)  # kerb, verge, paving, yards
         for side, block in product((-1, 1), self.blocks):
             y = _span(self.side_y(side, 0), side * BLOCK_DEPTH_M)
             land.box(block, y, (-0.5, street.kerb_m), Look(Material.SLAB, (0.52, 0.51, 0.49)))
@@ -149,7 +147,7 @@ class _World:
         # The height is independent, so that a detector cannot infer it from the footprint.
         length, width, height = (self.rng.uniform(*bounds) for bounds in objects.VEHICLE_SIZES[cls])
         if self.is_clear(x, y, length, width, yaw):
-            objects.add_vehicle(self.builder, self.rng, cls, (length, width, height), (x, y), yaw)
+            objects.add_vehicle(self, cls, (length, width, height), (x, y), yaw)
             self.taken += _discs(x, y, length, width, yaw)
         return length
 
@@ -175,13 +173,12 @@ class _World:
                 setback = walk + float(rng.choice([rng.uniform(0, 0.8), rng.uniform(1.5, 7)]))
                 height = float(rng.choice([rng.uniform(5, 10), rng.uniform(10, 18), rng.uniform(18, 38)]))
                 depth = rng.uniform(9, 16)
-                built = rng.random() < 0.88
+                built, xs = rng.random() < 0.88, (x, x + width)
                 if built:
-                    y = self.band_y(side, setback, setback + depth)
-                    objects.add_building(self.builder, rng, (x, x + width), y, (base, height))
+                    objects.add_building(self, xs, self.band_y(side, setback, setback + depth), (base, height))
                 if rng.random() < 0.35:
-                    y = self.band_y(side, setback + 22, setback + 40)
-                    objects.add_building(self.builder, rng, (x, x + width), y, (base, rng.uniform(25, 60)))
+                    y, z = self.band_y(side, setback + 22, setback + 40), (base, rng.uniform(25, 60))
+                    objects.add_building(self, xs, y, z)
                 gap = float(rng.choice([0.05, 0.05, rng.uniform(2, 9)]))
                 if not built or (gap > 1 and rng.random() < 0.7):
                     y = self.band_y(side, walk + 0.3, walk + 0.8)
@@ -192,7 +189,7 @@ class _World:
                         cls = SceneClass.VEGETATION if hedge else SceneClass.BUILDING
                         leaves = Look(Material.LEAF, objects.pick(rng, ((0.19, 0.27, 0.12),), 0.02)) if hedge else None
                         look = leaves or Look(Material.ROUGH, objects.pick(rng, objects.WALLS), (1.2, 0.08, 0, 0))
-                        self.builder.place((0.0, 0.0, 0.0), 0.0, cls).box(span, y, (base - 0.05, top), look)
+                        self.place(cls).box(span, y, (base - 0.05, top), look)
                 x += width + gap
 
     def add_background(self) -> None:
@@ -204,34 +201,30 @@ class _World:
                 width = min(rng.uniform(14, 34), end - 3 - x)
                 distance = rng.uniform(44, 62)
                 if rng.random() < 0.7:
-                    y = self.band_y(side, distance, distance + 14)
-                    height = rng.uniform(7, 24)
-                    objects.add_building(self.builder, rng, (x, x + width), y, (base, height), detailed=False)
+                    y, z = self.band_y(side, distance, distance + 14), (base, rng.uniform(7, 24))
+                    objects.add_building(self, (x, x + width), y, z, detailed=False)
                 else:
                     for k in range(int(width / 6)):
                         xyz = (x + 6 * k, self.side_y(side, distance - rng.uniform(0, 6)), base)
-                        objects.add_bush(self.builder, rng, xyz, scale=rng.uniform(4, 8))
+                        objects.add_bush(self, xyz, scale=rng.uniform(4, 8))
                 x += width + 0.1
         for direction in (-1, 1):
             if rng.random() < 0.7:
                 xs = _span(direction * rng.uniform(185, 240), direction * 258.0)
-                objects.add_building(self.builder, rng, xs, (-60, 60), (0.0, rng.uniform(14, 45)))
+                objects.add_building(self, xs, (-60, 60), (0.0, rng.uniform(14, 45)))
 
     def add_parked(self) -> None:
         for side in (-1, 1):
             if not self.street.parking[side > 0]:
                 continue
-            density = self.rng.uniform(0.35, 0.9)
-            x = -_PARKED_REACH_M
+            density, x = self.rng.uniform(0.35, 0.9), -_PARKED_REACH_M
             while x < _PARKED_REACH_M:
-                step = self.rng.uniform(0.7, 1.6)
+                step, length = self.rng.uniform(0.7, 1.6), 5.0
                 if self.rng.random() < density and not self.at_crossing(x, 9):
                     yaw = _heading(side) + math.radians(self.rng.normal(0, 1))
                     y = self.side_y(side, -1.15 + self.rng.normal(0, 0.06))
                     length = self.add_vehicle(_PARKED_SHARES, x + 2.5, y, yaw)
-                    x += (length + 5.0) / 2 + step
-                else:
-                    x += 5.0 + step
+                x += (length + 5.0) / 2 + step
 
     def add_moving(self) -> None:
         street = self.street
@@ -265,7 +258,7 @@ class _World:
             for k in range(-5, 6):
                 x = offset + k * lamps
                 if abs(x) < 90 and not self.at_crossing(x, 1):
-                    post = self.builder.place((x, self.side_y(side, 0.45), base), -side * math.pi / 2, SceneClass.POLE)
+                    post = self.place(SceneClass.POLE, (x, self.side_y(side, 0.45), base), -side * math.pi / 2)
                     height, grey = rng.uniform(5.5, 8.5), rng.uniform(0.25, 0.55)
                     metal = objects.plain((grey, grey, grey * 1.03))
                     post.cylinder((0, 0, height / 2), (0.075, 0.075), height / 2, metal)
@@ -280,12 +273,12 @@ class _World:
                     # Crowns stay off the vehicle's own place: its cameras would be inside the leaves.
                     y = self.side_y(side, 1.0)
                     reach = abs(y - float(self.ego2street[1, 3])) - 2.0 if abs(x) < 10 else math.inf
-                    objects.add_tree(self.builder, rng, (x, y, base), reach_m=max(reach, 0.5))
+                    objects.add_tree(self, (x, y, base), reach_m=max(reach, 0.5))
             for _ in range(int(rng.integers(2, 6))):
                 x = rng.uniform(-45, 60)
                 if not self.at_crossing(x, 1):
                     yaw = _heading(side) + rng.normal(0, 0.1)
-                    post = self.builder.place((x, self.side_y(side, 0.3), base), yaw, SceneClass.POLE)
+                    post = self.place(SceneClass.POLE, (x, self.side_y(side, 0.3), base), yaw)
                     height = rng.uniform(2.3, 3.0)
                     post.cylinder((0, 0, height / 2), (0.035, 0.035), height / 2, objects.plain((0.52, 0.53, 0.54)))
                     for k in range(int(rng.integers(1, 3))):  # plates that face the traffic
@@ -296,10 +289,10 @@ class _World:
                 x = rng.uniform(-60, 70)
                 if not self.at_crossing(x, 3):
                     behind = self.street.sidewalk_m[side > 0] - 0.6
-                    objects.add_bush(self.builder, rng, (x, self.side_y(side, behind), base))
+                    objects.add_bush(self, (x, self.side_y(side, behind), base))
             if not math.isinf(self.street.crossing_x_m):
                 x = self.street.crossing_x_m + side * (self.street.crossing_half_m + 0.5)
-                post = self.builder.place((x, self.side_y(side, 0.5), base), _heading(side), SceneClass.POLE)
+                post = self.place(SceneClass.POLE, (x, self.side_y(side, 0.5), base), _heading(side))
                 post.cylinder((0, 0, 1.7), (0.06, 0.06), 1.7, objects.plain((0.25, 0.26, 0.26)))
                 post.box((-0.28, -0.07), (-0.16, 0.16), (2.5, 3.4), Look(Material.SIGN, objects.DARK, (1.0, 0, 0, 0)))
 
@@ -312,14 +305,14 @@ class _World:
             y = self.side_y(side, rng.uniform(1.4, street.sidewalk_m[side > 0] - 0.4))
             if not self.at_crossing(x, 0.5):
                 yaw = float(rng.choice([0, math.pi])) + rng.normal(0, 0.2)
-                objects.add_pedestrian(self.builder, rng, (x, y, street.kerb_m), yaw)
+                objects.add_pedestrian(self, (x, y, street.kerb_m), yaw)
         if not math.isinf(street.crossing_x_m):
             for _ in range(int(rng.integers(0, 5))):
                 side = int(rng.choice([-1, 1]))
                 x = street.crossing_x_m + side * (street.crossing_half_m - 1.5) + rng.normal(0, 0.5)
                 y = rng.uniform(-street.half_width_m[0], street.half_width_m[1])
                 if self.is_clear(x, y, 0.6, 0.6, 0.0):
-                    objects.add_pedestrian(self.builder, rng, (x, y, 0.0), math.pi / 2 * float(rng.choice([-1, 1])))
+                    objects.add_pedestrian(self, (x, y, 0.0), math.pi / 2 * float(rng.choice([-1, 1])))
                     self.taken.append((x, y, 0.35))
 
 

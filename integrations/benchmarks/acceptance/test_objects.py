@@ -63,12 +63,11 @@ class Sums:
 
 def blocks(scene: Scene) -> Scene:
     """The street with every labelled object replaced by a block that fills its box."""
-    builder = SceneBuilder()
+    builder = SceneBuilder(np.random.default_rng(0))
     for box, box_class in zip(scene.boxes, scene.box_classes, strict=True):
-        row = builder.add_box(box[:3], tuple(box[3:6]), box[6], BoxClass(int(box_class)))
         of = SceneClass.PEDESTRIAN if box_class == BoxClass.PEDESTRIAN else SceneClass.VEHICLE
         x, y, z = box[3:6] / 2
-        place = builder.place(tuple(box[:3]), box[6], of, row)
+        place = builder.place(of, tuple(box[:3]), box[6], (BoxClass(int(box_class)), tuple(box[3:6])))
         place.box((-x, x), (-y, y), (-z, z), Look(Material.PLAIN, (0.5, 0.5, 0.5)))
     unlabelled, new = scene.instance < 0, builder.arrays()
     parts = [name for name in new if name not in ("boxes", "box_classes")]
