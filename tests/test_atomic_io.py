@@ -192,7 +192,7 @@ def with_pipe(folder: Path, name: str = "config.json") -> Path:
     "load",
     [
         lambda folder: load_inpainter(with_pipe(folder, "model_index.json")),
-        lambda folder: PipelineInpainter.from_pretrained(with_pipe(folder)),
+        lambda folder: PipelineInpainter(with_pipe(folder)),
         lambda folder: read_checkpoint(with_pipe(folder, FILE)),
         lambda folder: TorchScriptInpainter(with_pipe(folder) / "config.json"),
         lambda folder: TransformersDepth(str(with_pipe(folder))),

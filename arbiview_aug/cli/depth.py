@@ -27,11 +27,11 @@ from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, D
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import OutputError, WarnOnce, described
-from arbiview_aug.sample.frame import Neighbour
-from arbiview_aug.sample.inputs import read_frames, read_scene
+from arbiview_aug.sample.frame import Frame, Neighbour
+from arbiview_aug.sample.inputs import MOTION_KEY, read_frames, read_scene
 from arbiview_aug.sample.neighbours import neighbour_images
 from arbiview_aug.scene.depth_map import points_of
-from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, TransformersDepth, learned_depth
+from arbiview_aug.temporal.learned_depth import CameraFit, TransformersDepth, learned_depth
 from arbiview_aug.temporal.motion_depth import motion_depth, warm_up
 
 
@@ -49,7 +49,7 @@ class _Loaded(NamedTuple):
     """A frame for a network, and the origin to record in its file."""
 
     token: str
-    inputs: DepthInputs
+    frame: Frame  # its points and depth are the references that were asked for
     origin: Sequence[str]
 
 
@@ -115,7 +115,8 @@ def _for_network(
     there = depths.find(token, sample["rig"], origin, "learned")
     if there is not None:
         return Done(token, "kept", density=there.density)
-    return _Loaded(token, DepthInputs(frame.rig, frame.images, points, from_motion, scene.boxes), origin)
+    depth = {} if from_motion is None else {MOTION_KEY: from_motion.depth_m}
+    return _Loaded(token, Frame(frame.images, frame.rig, points, scene.boxes, depth), origin)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -179,9 +180,9 @@ def _learned(
             yield frame
         elif frame is not None:
             waiting.append(frame)
-        if frame is None or sum(len(loaded.inputs.rig) for loaded in waiting) >= arguments.batch:
-            fitted = learned_depth(model, [loaded.inputs for loaded in waiting], arguments.batch, wanted)
+        if frame is None or sum(len(loaded.frame.rig) for loaded in waiting) >= arguments.batch:
+            fitted = learned_depth(model, [loaded.frame for loaded in waiting], arguments.batch, wanted)
             for loaded, (depth, fits) in zip(waiting, fitted, strict=True):
-                depths.write(loaded.token, loaded.inputs.rig, depth, loaded.origin)
+                depths.write(loaded.token, loaded.frame.rig, depth, loaded.origin)
                 yield Done(loaded.token, "made", "; ".join(map(str, fits)), depth.density, fits)
             waiting.clear()

@@ -31,13 +31,14 @@ each Attention^(l) a softmax over the 3 x 3 tokens around p_j^(l), with PE(Δp) 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
+from torch.utils._pytree import tree_map  # as in diffusers
 
 from arbiview_aug.cameras.camera import Camera, Rays
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
@@ -140,16 +141,6 @@ def _slot(j: int, centre: FloatArray, valid: BoolArray) -> Correspondence:
     return Correspondence(*(tensor[None, None, None] for tensor in tensors))
 
 
-def mapped(function: Callable[..., torch.Tensor], *values: _Nested) -> _Nested:
-    """Apply a function to tensors, or to those at each place of nested tuples and lists of one structure."""
-    nested: Any = values
-    first: Any = values[0]
-    if isinstance(first, torch.Tensor):
-        return function(*nested)  # type: ignore[return-value]
-    parts = [mapped(function, *parts) for parts in zip(*nested, strict=True)]
-    return first._make(parts) if hasattr(first, "_make") else type(first)(parts)
-
-
 def joined(parts: Sequence[_Nested], axis: int = 0) -> _Nested:
     """Join (nested) tensors along an axis; the others are padded with zeros to the largest."""
 
@@ -161,7 +152,7 @@ def joined(parts: Sequence[_Nested], axis: int = 0) -> _Nested:
             padded.append(functional.pad(tensor, [n for more in reversed(missing) for n in (0, more)]))
         return torch.cat(padded, axis)
 
-    return mapped(join, *parts)
+    return tree_map(join, *parts)
 
 
 # --- windows ----------------------------------------------------------------------------------------------------------

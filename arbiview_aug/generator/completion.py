@@ -16,10 +16,11 @@ from pathlib import Path
 
 import torch
 from torch.nn import functional
+from torch.utils._pytree import tree_map
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator.attention import TokenWindow, joined, mapped
+from arbiview_aug.generator.attention import TokenWindow, joined
 from arbiview_aug.generator.conditioning import Branches, ViewInputs, frame_geometry, nearest_sources
 from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, noise_schedule
@@ -210,7 +211,7 @@ class Diffusion(Inpainter, torch.nn.Module):
         for (count, _), group in alike.items():
             size = max(1, VIEWS_AT_ONCE // count)
             for together in (group[start : start + size] for start in range(0, len(group), size)):
-                batch = mapped(lambda tensor: tensor.to(device), joined([inputs for _, _, inputs in together]))
+                batch = tree_map(lambda tensor: tensor.to(device), joined([inputs for _, _, inputs in together]))
                 made = denoised(self.generator, self.config, *batch).cpu()
                 for (n, left, (targets, *_)), generated in zip(together, made, strict=True):
                     for m, change in zip(left, generated - targets.images[0], strict=True):
@@ -272,5 +273,5 @@ def load_inpainter(where: str | Path | None, *, steps: int | None = None) -> Dif
         expected = "a folder of a generator or of diffusers, a TorchScript file, or OWNER/NAME on the Hugging Face Hub"
         raise GeneratorError(f"generator {where}: expected {expected}, found none")
     if not is_there or (Path(where) / "model_index.json").is_file():
-        return PipelineInpainter.from_pretrained(where, steps=steps)
+        return PipelineInpainter(where, steps=steps)
     return Diffusion(where, steps=steps)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from arbiview_aug.inpaint.continued import Continue as Continue
     from arbiview_aug.inpaint.continued import Mean as Mean
     from arbiview_aug.inpaint.inpainter import Black as Black
-    from arbiview_aug.inpaint.inpainter import CompletedLoader as CompletedLoader
     from arbiview_aug.inpaint.inpainter import Inpainter as Inpainter
     from arbiview_aug.inpaint.inpainter import Telea as Telea
     from arbiview_aug.inpaint.networks import NetworkInpainter as NetworkInpainter

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -13,6 +13,7 @@ import torch
 
 from arbiview_aug.choices import is_number, is_whole
 from arbiview_aug.errors import GeneratorError, SampleError, shown
+from arbiview_aug.image_ops import bounding_box
 from arbiview_aug.render.rendered import MAP_KEYS, LabelFill, Views
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.frame import Frame
@@ -200,8 +201,7 @@ def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
     is_uint8 = image.dtype == torch.uint8
     if hole.all():
         return torch.full_like(image, round(GREY * 255) if is_uint8 else GREY)
-    rows, columns = (hole.any(1 - axis).nonzero() for axis in (0, 1))
-    box = tuple(slice(max(int(i.min()) - _MARGIN_PX, 0), int(i.max()) + 1 + _MARGIN_PX) for i in (rows, columns))
+    box = bounding_box(hole.cpu().numpy(), _MARGIN_PX)
     part, marks = image[:, box[0], box[1]].detach(), hole[box]
     pixels = part if is_uint8 else (part.float() * 255).round().clamp(0, 255).to(torch.uint8)
     planes = np.ascontiguousarray(pixels.cpu().permute(1, 2, 0).numpy())
@@ -280,24 +280,3 @@ def check_device(network: Any) -> None:
             "a generator on a GPU cannot run in DataLoader workers: use num_workers=0, keep the generator on the "
             "CPU, or complete batches after they are collated"
         )
-
-
-class CompletedLoader:
-    """Loader that fills the batches of another loader in this process, on the device of the inpainter's network.
-
-    ``loader`` yields batches from ``RigRetarget(..., keys=SampleKeys(extra=("sources", "confidence")))``.
-    """
-
-    def __init__(self, loader: Iterable[Mapping[str, Any]], inpainter: Inpainter) -> None:
-        if not callable(getattr(inpainter, "complete_batch", None)):
-            raise ValueError(
-                f"inpainter: expected an Inpainter, such as Diffusion(generator), got {type(inpainter).__name__}"
-            )
-        self.loader, self.inpainter = loader, inpainter
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        for batch in self.loader:
-            yield self.inpainter.complete_batch(batch)
-
-    def __len__(self) -> int:
-        return len(self.loader)  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from abc import abstractmethod
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import groupby, zip_longest
 from pathlib import Path
@@ -26,11 +26,11 @@ from arbiview_aug.choices import is_whole
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, one_line
 from arbiview_aug.files import check_regular, open_regular
+from arbiview_aug.image_ops import bounding_box
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, checked_settings, telea
 
 NARROW_PX = 5  # holes narrower than this are inpainted by Telea's method
 _SEED = 2**31
-_PIPELINE_SETTINGS = ("size", "batch", "prompt", "steps", "guidance", "min_confidence", "seed")
 _JOINED_PX = 8  # holes nearer than this to each other are one
 _CONTEXT_PX = (12, 64)
 """Minimum and maximum context around a hole, pixels; in between, half of its shorter side."""
@@ -99,21 +99,22 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         check_device(self)
         tops = [255.0 if view.dtype == torch.uint8 else 1.0 for view in views]
         # The network sees narrow holes inpainted, and they stay so.
-        pixels = [telea(v, hole).float().cpu().numpy() / top for v, hole, top in zip(views, holes, tops, strict=True)]
+        pixels = [(telea(v, hole).float() / top).cpu().numpy() for v, hole, top in zip(views, holes, tops, strict=True)]
         # The remaining holes hold squares of NARROW_PX; the others are cracks and edges.
         masks, square = [hole.cpu().numpy().astype(np.uint8) for hole in holes], np.ones((NARROW_PX,) * 2, np.uint8)
         border: Any = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}  # by default all outside a view is a hole
         left = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, square, **border).astype(bool) for mask in masks]
         frame_of = np.repeat(np.arange(len(counts)), counts)
         for together in windows(left, self.size):
-            alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
+            alike: dict[tuple[int, ...], list[tuple[Canvas, npt.NDArray[np.float32]]]] = defaultdict(list)
             # Frames share calls, but no canvas: a network sees all of it.
             for _, parts in groupby(together, lambda window: frame_of[window.view]):
-                for canvas in packed(list(parts), self.size, self.multiple):
-                    alike[canvas.size].append(canvas)
-            for canvases in alike.values():
-                for start in range(0, len(canvases), self.batch):
-                    self._fill(canvases[start : start + self.batch], pixels, left, seeds)
+                for canvas in packed(parts, self.size):
+                    drawing = drawn(canvas, pixels, left, self.multiple)
+                    alike[drawing.shape].append((canvas, drawing))
+            for group in alike.values():
+                for start in range(0, len(group), self.batch):
+                    self._fill(group[start : start + self.batch], pixels, left, seeds)
         filled = []
         for view, hole, view_pixels, top in zip(views, holes, pixels, tops, strict=True):
             values = torch.from_numpy(view_pixels * top).to(view.device)
@@ -121,13 +122,11 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
             filled.append(torch.where(hole, values.to(view.dtype), view))
         return filled
 
-    def _fill(
-        self, canvases: Sequence[Canvas], pixels: Sequence[np.ndarray], left: Sequence[np.ndarray], seeds: Sequence[int]
-    ) -> None:
-        """Inpaint canvases of one size, and put their pixels where they belong; their holes are no longer left."""
-        drawings = [drawn(canvas, pixels, left) for canvas in canvases]
-        images, holes = (torch.from_numpy(np.stack(part)).to(self.device) for part in zip(*drawings, strict=True))
-        outputs = self.run(images, holes, [seeds[canvas.windows[0][0].view] for canvas in canvases])
+    def _fill(self, group: Any, pixels: Any, left: Any, seeds: Sequence[int]) -> None:
+        """Inpaint drawn canvases of one size, and put their pixels where they belong; their holes are left no more."""
+        canvases, drawings = zip(*group, strict=True)
+        images, holes = torch.from_numpy(np.stack(drawings)).to(self.device).split((3, 1), 1)
+        outputs = self.run(images, holes[:, 0] > 0, [seeds[canvas[0][0].view] for canvas in canvases])
         if not isinstance(outputs, torch.Tensor) or outputs.shape != images.shape:
             got = tuple(getattr(outputs, "shape", ())) or type(outputs).__name__
             raise GeneratorError(f"inpainting: expected images {tuple(images.shape)}, got {got}")
@@ -135,7 +134,7 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
             raise GeneratorError("inpainting: expected finite images, got NaN or infinity; try float32")
         painted = outputs.float().clamp(0, 1).cpu().numpy()
         for canvas, image in zip(canvases, painted, strict=True):
-            for window, top, at in canvas.windows:
+            for window, top, at in canvas:
                 h, w = window.fills.shape
                 window.of(pixels[window.view])[:, window.fills] = image[:, top : top + h, at : at + w][:, window.fills]
                 window.of(left[window.view])[window.fills] = False
@@ -145,13 +144,18 @@ class PipelineInpainter(NetworkInpainter):
     """One of diffusers' inpainting pipelines: Stable Diffusion, SDXL, Flux and others.
 
     Args:
-        pipeline: A pipeline of ``AutoPipelineForInpainting``; ``from_pretrained`` loads one.
+        pipeline: Its folder or hub id in diffusers' layout, or a pipeline of ``AutoPipelineForInpainting``, for example
+            one loaded in half precision.
         size: Longest side of an image that it sees; None: the pipeline's own.
         batch: Images that it sees at once.
         prompt: Text prompt for the holes.
         steps: Steps of the pipeline; None: its own.
         guidance: Guidance of the pipeline; None: its own.
-        settings: ``min_confidence`` and ``seed``, as for every ``Inpainter``.
+        min_confidence: As for every ``Inpainter``, like ``seed``.
+
+    Raises:
+        ImportError: diffusers or transformers are missing.
+        GeneratorError: No such pipeline.
     """
 
     def __init__(
@@ -163,38 +167,27 @@ class PipelineInpainter(NetworkInpainter):
         prompt: str = "",
         steps: int | None = None,
         guidance: float | None = None,
-        **settings: Any,
+        min_confidence: float = 0.0,
+        seed: int = 0,
     ) -> None:
+        checked_settings(min_confidence, seed, steps, guidance)
+        if isinstance(pipeline, str | Path):
+            diffusers, where = optional_package("diffusers", "generator"), pipeline
+            optional_package("transformers", "generator")
+            try:
+                check_regular(where)
+                pipeline = diffusers.AutoPipelineForInpainting.from_pretrained(where)
+            except (OSError, ValueError, RuntimeError, AttributeError) as error:
+                expected = "expected an inpainting pipeline of diffusers"
+                raise GeneratorError(f"{where}: {expected}: {one_line(error)}") from None
         parts = {name: part for name, part in pipeline.components.items() if isinstance(part, torch.nn.Module)}
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer
         native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
-        size = native_px if size is None else size
-        super().__init__(torch.nn.ModuleDict(parts), size, multiple, batch, **settings)
-        checked_settings(self.min_confidence, self.seed, steps, guidance)
+        size, network = native_px if size is None else size, torch.nn.ModuleDict(parts)
+        super().__init__(network, size, multiple, batch, min_confidence=min_confidence, seed=seed)
         self.pipeline, self.prompt, self.steps, self.guidance = pipeline, prompt, steps, guidance
         pipeline.set_progress_bar_config(disable=True)
-
-    @classmethod
-    def from_pretrained(cls, where: str | Path, **settings: Any) -> PipelineInpainter:
-        """Load a pipeline from a folder or hub id in diffusers' layout.
-
-        ``settings`` are those of the class, and arguments of diffusers' ``from_pretrained``, for example
-        ``torch_dtype`` or ``revision``.
-
-        Raises:
-            ImportError: diffusers or transformers are missing.
-            GeneratorError: No such pipeline.
-        """
-        diffusers = optional_package("diffusers", "generator")
-        optional_package("transformers", "generator")
-        own = {name: settings.pop(name) for name in _PIPELINE_SETTINGS if name in settings}
-        try:
-            check_regular(where)
-            pipeline = diffusers.AutoPipelineForInpainting.from_pretrained(where, **settings)
-        except (OSError, ValueError, RuntimeError, AttributeError) as error:
-            raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {one_line(error)}") from None
-        return cls(pipeline, **own)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         h, w = images.shape[-2:]
@@ -279,11 +272,8 @@ class Window(NamedTuple):
         return array[..., self.top : self.top + h, self.left : self.left + w]
 
 
-class Canvas(NamedTuple):
-    """Windows that a network sees in one image."""
-
-    size: tuple[int, int]  # (h, w) in pixels, multiples of the network's
-    windows: list[tuple[Window, int, int]]  # with the row and the column of each on the canvas, in order of these
+Canvas = list[tuple[Window, int, int]]
+"""Windows that a network sees in one image, with the row and the column of each in it, in order of these."""
 
 
 def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
@@ -305,9 +295,8 @@ def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
 
 def _parts(hole: Window, shape: tuple[int, ...], size: int) -> Iterator[Window]:
     """Cut a hole of a view (h, w) in halves until its windows fit, and while halves are small together."""
-    rows, columns = (np.flatnonzero(hole.fills.any(1 - axis)) for axis in (0, 1))
-    part = hole.fills[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    top, left = hole.top + int(rows[0]), hole.left + int(columns[0])
+    rows, columns = bounding_box(hole.fills)
+    part, top, left = hole.fills[rows, columns], hole.top + rows.start, hole.left + columns.start
     context = min(int(np.clip(min(part.shape) // 2, *_CONTEXT_PX)), size // 4)
     margins = [
         (min(context, low), min(context, side - low - length))
@@ -329,46 +318,35 @@ def _area(hole: BoolArray, context: int) -> int:
     return int(np.prod([np.ptp(at) + 1 + 2 * context for at in hole.nonzero()]))
 
 
-def packed(parts: Sequence[Window], size: int, multiple: int) -> list[Canvas]:
-    """Pack windows on canvases of at most ``size`` by ``size``: first fit on shelves, tallest windows first."""
-    shelves: list[list[int]] = []  # canvas, row, height, columns taken
-    rows: list[int] = []  # taken of each canvas
-    placed: list[list[tuple[Window, int, int]]] = []
+def packed(parts: Iterable[Window], size: int) -> list[Canvas]:
+    """Pack windows on canvases of at most ``size`` by ``size``: in rows from left to right, tallest windows first."""
+    canvases, top, left, height = list[Canvas](), 0, size, size
     for window in sorted(parts, key=lambda item: item.fills.shape, reverse=True):
         h, w = window.fills.shape
-        shelf = next((item for item in shelves if item[2] >= h and item[3] + w <= size), None)
-        if shelf is None:
-            canvas = next((k for k, taken in enumerate(rows) if taken + h <= size), len(rows))
-            if canvas == len(rows):
-                rows.append(0)
-                placed.append([])
-            shelf = [canvas, rows[canvas], h, 0]
-            shelves.append(shelf)
-            rows[canvas] += h
-        placed[shelf[0]].append((window, shelf[1], shelf[3]))
-        shelf[3] += w
-    canvases = []
-    for taken, on_canvas in zip(rows, placed, strict=True):
-        wide = max(left + window.fills.shape[1] for window, _, left in on_canvas)
-        size_px = -(-taken // multiple) * multiple, -(-wide // multiple) * multiple
-        canvases.append(Canvas(size_px, sorted(on_canvas, key=lambda item: item[1:])))
+        if left + w > size:  # the next row, whose first window is its tallest
+            top, left, height = top + height, 0, h
+            if top + h > size:
+                canvases.append([])
+                top = 0
+        canvases[-1].append((window, top, left))
+        left += w
     return canvases
 
 
 def drawn(
-    canvas: Canvas, views: Sequence[npt.NDArray[np.float32]], holes: Sequence[BoolArray]
-) -> tuple[npt.NDArray[np.float32], BoolArray]:
-    """A canvas's pixels (3, h, w), its holes black, and where they are (h, w).
+    canvas: Canvas, views: Sequence[npt.NDArray[np.float32]], holes: Sequence[BoolArray], multiple: int
+) -> npt.NDArray[np.float32]:
+    """A canvas's pixels, its holes black, and where they are (4, h, w); its sides are multiples of ``multiple``.
 
     The rest repeats the windows' borders, so that the canvas has no artificial edges.
     """
-    pixels, marks = np.zeros((3, *canvas.size), np.float32), np.zeros(canvas.size, bool)
-    for window, top, left in canvas.windows:
-        h, w = window.fills.shape
-        window_pixels = window.of(views[window.view])
+    ends = [(top + window.fills.shape[0], left + window.fills.shape[1]) for window, top, left in canvas]
+    h, w = (-(-max(end) // multiple) * multiple for end in zip(*ends, strict=True))
+    pixels, marks = np.zeros((3, h, w), np.float32), np.zeros((1, h, w), bool)
+    for (window, top, left), (bottom, right) in zip(canvas, ends, strict=True):
         # To the canvas's far corner; later windows, to the right and below, draw over it.
-        beyond = canvas.size[0] - top - h, canvas.size[1] - left - w
-        pixels[:, top:, left:] = np.pad(window_pixels, ((0, 0), (0, beyond[0]), (0, beyond[1])), mode="edge")
-        marks[top:, left:] = False
-        marks[top : top + h, left : left + w] = window.of(holes[window.view])
-    return pixels * ~marks, marks
+        beyond = (0, 0), (0, h - bottom), (0, w - right)
+        pixels[:, top:, left:] = np.pad(window.of(views[window.view]), beyond, mode="edge")
+        marks[:, top:, left:] = False
+        marks[:, top:bottom, left:right] = window.of(holes[window.view])
+    return np.concatenate([pixels * ~marks, marks], dtype=np.float32)

@@ -36,9 +36,6 @@ _SQUARE = np.float32(1 / (2 * RADIUS_PX + 1) ** 2 / LEVELS**2)
 _PER_CORRELATION, _INVALID = np.float32(PER_CORRELATION), np.float32(INVALID)
 _OUTSIDE = np.uint16(60000)
 
-NODE_PX = 8
-"""Distance of the pixels that are projected to find which part of a surface a neighbour sees."""
-
 _LEVEL, _RIGHT, _MASK_BIT, _NONE = np.int32(0x7FFF), np.int32(16), np.int32(15), np.int32(0)  # of ``SweptImage.quads``
 _WIDER, _INFINITY = 2 * RADIUS_PX, np.float32(np.inf)
 # Unsigned, so that no index is tested for being negative, and loops become vector instructions.
@@ -47,15 +44,14 @@ _U1, _U2, _U3, _U4, _U5, _U6, _RADIUS = (np.uint64(n) for n in (1, 2, 3, 4, 5, 6
 
 @compiled
 def match_walls(
-    rays: Any, road: Any, horizontal: Any, nodes: Any, windows: Any, walls: Any, offset: Any, lens: Any, quads: Any,
-    costs: Any,
-) -> None:  # fmt: skip
+    rays: Any, road: Any, horizontal: Any, windows: Any, walls: Any, offset: Any, lens: Any, quads: Any, costs: Any
+) -> None:
     """Costs (h, K, w) of surfaces by the normalised cross-correlation of windows.
 
     ``rays`` (3, h, w) are in the neighbour's frame, where they start at ``offset`` (3,); for a pinhole both are times
-    its intrinsics. ``nodes`` are every ``NODE_PX``-th and the last of them, of ``road`` and of ``horizontal``. Those,
-    and ``windows``, are of a ``SweptImage``. ``walls`` (K,) are 1/radius, ascending; ``lens`` is the neighbour's code,
-    its ``Camera.parameters``, and positions (K, 2, h, w) for a negative code; ``quads`` (H, W) are those of its image.
+    its intrinsics. ``road``, ``horizontal`` and ``windows`` are of a ``SweptImage``. ``walls`` (K,) are 1/radius,
+    ascending; ``lens`` is the neighbour's code, its ``Camera.parameters``, and positions (K, 2, h, w) for a negative
+    code; ``quads`` (H, W) are those of its image.
     """
     h, w = road.shape
     surface, lines, sums = (rays, road, horizontal), np.empty((7, w), np.float32), np.empty((3, w + _WIDER), np.int32)
@@ -67,47 +63,40 @@ def match_walls(
             one = road[y, x] / horizontal[y, x]
             touching[y] = one if one < touching[y] or one != one else touching[y]  # NaN once, NaN for ever
     for k in range(walls.shape[0]):
-        rows, box = h, (0, h, 0, w)
+        rows = h
         while k and rows and walls[k] < touching[rows - 1]:  # as over the wall before
             rows -= 1
         rows = min(rows + RADIUS_PX, h)
-        if lens[0] >= 0:
-            box = _seen_box(nodes, walls[k], offset, lens, quads.shape, (h, w), lines)
-        top, bottom, left, right = box[0], min(box[1], rows), box[2], box[3]
-        for y in range(rows):
-            for x in range(w):
-                costs[y, k, x] = _UNSEEN
-        if top < bottom:
-            box = top, bottom, left, right
-            _read(surface, walls[k], offset, lens, k, quads, box, lines, read, seen)
-            _correlate(read, seen, windows, sums, box, k, costs)
+        _read(surface, walls[k], offset, lens, k, quads, rows, lines, read, seen)
+        _correlate(read, seen, windows, sums, rows, k, costs)
         for y in range(rows, h):
             for x in range(w):
                 costs[y, k, x] = costs[y, k - 1, x]
 
 
 @inlined
-def _project_row(surface: Any, y: Any, columns: Any, wall: Any, offset: Any, lens: Any, lines: Any, parts: Any) -> None:
-    """Project row ``y`` of a surface between two columns; ``parts`` of ``lines`` are the same columns."""
+def _project_row(surface: Any, y: Any, wall: Any, offset: Any, lens: Any, lines: Any) -> None:
+    """Project row ``y`` of a surface into the first two of ``lines``."""
     rays, road, horizontal = surface
-    u, v, q, px, py, pz, _ = lines
-    for x in range(columns[0], columns[1]):
+    u, v, q, px, py, pz, radius = lines[0], lines[1], lines[2], lines[3], lines[4], lines[5], lines[6]
+    n = np.uint64(lines.shape[1])
+    for x in range(n):
         q[x] = max(road[y, x], wall * horizontal[y, x])
-    for x in range(columns[0], columns[1]):
+    for x in range(n):
         px[x] = rays[0, y, x] + offset[0] * q[x]
-    for x in range(columns[0], columns[1]):
+    for x in range(n):
         py[x] = rays[1, y, x] + offset[1] * q[x]
-    for x in range(columns[0], columns[1]):
+    for x in range(n):
         pz[x] = rays[2, y, x] + offset[2] * q[x]
     if lens[0] == 0:
-        for x in range(columns[0], columns[1]):
+        for x in range(n):
             pz[x] = _ONE / pz[x] if pz[x] > _ZERO else _INFINITY  # outside the image, or NaN
-        for x in range(columns[0], columns[1]):
+        for x in range(n):
             u[x] = px[x] * pz[x]
-        for x in range(columns[0], columns[1]):
+        for x in range(n):
             v[x] = py[x] * pz[x]
     else:
-        project_row(parts[3], parts[4], parts[5], lens[0], lens[1], parts[2], parts[6], parts[0], parts[1])
+        project_row(px, py, pz, lens[0], lens[1], q, radius, u, v)
 
 
 @inlined
@@ -118,71 +107,43 @@ def _seven(line: Any, x: Any) -> Any:
     return np.float32(np.int32(np.int32(a + b) + c))
 
 
-@inlined
-def _columns(lines: Any, first: Any, last: Any) -> Any:
-    return (
-        lines[0][first:last], lines[1][first:last], lines[2][first:last], lines[3][first:last], lines[4][first:last],
-        lines[5][first:last], lines[6][first:last],
-    )  # fmt: skip
-
-
-@called
-def _seen_box(nodes: Any, wall: Any, offset: Any, lens: Any, other_size: Any, size: Any, lines: Any) -> Any:
-    """Rows and columns (top, bottom, left, right) outside which a neighbour sees no point of a surface."""
-    ny, nx = nodes[1].shape
-    top, bottom, left, right = ny, -1, nx, -1
-    last_y, last_x = np.float32(other_size[0] - 1), np.float32(other_size[1] - 1)
-    parts, columns = _columns(lines, 0, nx), (np.uint64(0), np.uint64(nx))
-    u, v = parts[0], parts[1]
-    for y in range(ny):
-        _project_row(nodes, y, columns, wall, offset, lens, parts, parts)
-        for x in range(nx):
-            if (u[x] >= _ZERO) & (u[x] <= last_x) & (v[x] >= _ZERO) & (v[x] <= last_y):
-                top, bottom, left, right = min(top, y), y, min(left, x), max(right, x)
-    if bottom < 0:
-        return 0, 0, 0, 0
-    top, left = max(top - 1, 0) * NODE_PX, max(left - 1, 0) * NODE_PX
-    return top, min((bottom + 1) * NODE_PX, size[0]), left, min((right + 1) * NODE_PX, size[1])
-
-
 @called
 def _read(
-    surface: Any, wall: Any, offset: Any, lens: Any, k: Any, quads: Any, box: Any, lines: Any, read: Any, seen: Any
+    surface: Any, wall: Any, offset: Any, lens: Any, k: Any, quads: Any, rows: Any, lines: Any, read: Any, seen: Any
 ) -> None:
-    """Read a box and a window around it of a neighbour's image as over a surface.
+    """Read the first ``rows``, and a window below them, of a neighbour's image as over a surface.
 
     Levels are bilinear, those of the image's border beyond it; ``seen`` is the mask at the nearest pixel.
     """
-    (h, w), left, right = seen.shape, max(box[2] - RADIUS_PX, 0), min(box[3] + RADIUS_PX, seen.shape[1])
-    whole, parts, first, last = _columns(lines, 0, w), _columns(lines, left, right), np.uint64(left), np.uint64(right)
-    u, v, s, t = whole[0], whole[1], whole[4], whole[5]
+    h, w = seen.shape
+    u, v, s, t, n = lines[0], lines[1], lines[4], lines[5], np.uint64(w)
     image, width = quads.ravel(), np.int32(quads.shape[1])
     last_x, last_y = np.float32(quads.shape[1] - 2), np.float32(quads.shape[0] - 2)
     at, words = np.empty(w, np.int32), np.empty(w, np.int64)
     halves = words.view(np.int32)
-    for y in range(max(box[0] - RADIUS_PX, 0), min(box[1] + RADIUS_PX, h)):
+    for y in range(min(rows + RADIUS_PX, h)):
         if lens[0] < 0:
-            for x in range(first, last):
+            for x in range(n):
                 u[x], v[x] = lens[2][k, 0, y, x], lens[2][k, 1, y, x]
         else:
-            _project_row(surface, y, (first, last), wall, offset, lens, whole, parts)
-        for x in range(first, last):
+            _project_row(surface, y, wall, offset, lens, lines)
+        for x in range(n):
             column, row = min(u[x] if u[x] > _ZERO else _ZERO, last_x), min(v[x] if v[x] > _ZERO else _ZERO, last_y)
             at[x] = np.int32(np.int32(np.int32(row) * width) + np.int32(column))
-        for x in range(first, last):
+        for x in range(n):
             column = min(u[x] if u[x] > _ZERO else _ZERO, last_x + _ONE)
             t[x] = column - np.float32(np.int32(min(column, last_x)))
-        for x in range(first, last):
+        for x in range(n):
             row = min(v[x] if v[x] > _ZERO else _ZERO, last_y + _ONE)
             s[x] = row - np.float32(np.int32(min(row, last_y)))
-        for x in range(first, last):  # no vector instruction: alone for that
+        for x in range(n):  # no vector instruction: alone for that
             words[x] = image[np.uint64(at[x])]
-        for x in range(first, last):
+        for x in range(n):
             inside = (u[x] >= _ZERO) & (u[x] <= last_x + _ONE) & (v[x] >= _ZERO) & (v[x] <= last_y + _ONE)
             right, below = _RIGHT if t[x] >= _HALF else _NONE, np.int32(32) if s[x] >= _HALF else _NONE
             bit = np.int32(words[x] >> np.int32(_MASK_BIT + right + below))
             seen[y, x] = np.int32(bit & np.int32(1)) if inside else _NONE
-        for x in range(first, last):
+        for x in range(n):
             a, b = halves[_U2 * x], halves[_U2 * x + _U1]
             a0, a1 = np.float32(a & _LEVEL), np.float32(np.int32(a >> _RIGHT) & _LEVEL)
             b0, b1 = np.float32(b & _LEVEL), np.float32(np.int32(b >> _RIGHT) & _LEVEL)
@@ -194,27 +155,27 @@ def _read(
 
 
 @called
-def _correlate(read: Any, seen: Any, windows: Any, sums: Any, box: Any, k: Any, costs: Any) -> None:
-    """Costs of wall ``k`` in a box of an image as it was read (h + 1, w + 6); ``sums`` (3, w + 6) is scratch."""
+def _correlate(read: Any, seen: Any, windows: Any, sums: Any, rows: Any, k: Any, costs: Any) -> None:
+    """Costs of wall ``k`` in the first ``rows`` of an image that was read (h + 1, w + 6), with scratch (3, w + 6)."""
     levels, mean, weight = windows
     values, squares, products = sums[0], sums[1], sums[2]  # of columns
-    h, top, left, right = levels.shape[0], box[0], np.uint64(box[2]), np.uint64(box[3])
-    end = right + np.uint64(_WIDER)
+    h, right = levels.shape[0], np.uint64(levels.shape[1] - _WIDER)
+    end = np.uint64(levels.shape[1])
     sums[:] = 0
-    for y in range(top - 2 * RADIUS_PX, box[1]):
+    for y in range(-2 * RADIUS_PX, rows):
         new, old = min(max(y + RADIUS_PX, 0), h - 1), max(y - RADIUS_PX - 1, 0)
-        row = old if y > top else h
-        for x in range(left, end):
+        row = old if y > 0 else h
+        for x in range(end):
             values[x] = np.int32(values[x] + np.int32(read[new, x] - read[row, x]))
-        for x in range(left, end):
+        for x in range(end):
             a, c = read[new, x], read[row, x]
             squares[x] = np.int32(squares[x] + np.int32(np.int32(a + c) * np.int32(a - c)))
-        for x in range(left, end):
+        for x in range(end):
             a, c = read[new, x], read[row, x]
             products[x] = np.int32(products[x] + np.int32(np.int32(a * levels[new, x]) - np.int32(c * levels[old, x])))
-        if y < top:
+        if y < 0:
             continue
-        for x in range(left, right):
+        for x in range(right):
             average = _seven(values, x) * _MEAN
             variance = max(_seven(squares, x) * _SQUARE - average * average, _ZERO) + _NOISE
             covariance = _seven(products, x) * _SQUARE - average * mean[y, x]

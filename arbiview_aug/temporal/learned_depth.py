@@ -20,11 +20,12 @@ import torch
 from arbiview_aug.atomic_io import checksum
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reference
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
 from arbiview_aug.files import check_regular
+from arbiview_aug.sample.frame import Frame
+from arbiview_aug.sample.inputs import MOTION_KEY
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.surface import Layer, plane_inverse_distance
@@ -59,16 +60,6 @@ Output = Literal["depth", "inverse"] | None
 """Output of a network: depth, inverse depth, or None if the fit decides."""
 
 
-class DepthInputs(NamedTuple):
-    """A frame and the references of its depth: (P, 3) LiDAR points, depth from motion, (B, 7) labelled objects."""
-
-    rig: Rig
-    images: Sequence[torch.Tensor]
-    points: FloatArray | None = None
-    motion: MotionDepth | None = None
-    boxes: FloatArray | None = None
-
-
 class CameraFit(NamedTuple):
     """Fit of a camera's prediction to metres, or the reason why it was declined."""
 
@@ -87,13 +78,14 @@ class CameraFit(NamedTuple):
 
 def learned_depth(
     model: TransformersDepth,
-    frames: Sequence[DepthInputs],
+    frames: Sequence[Frame],
     batch: int,
     wanted: Sequence[Reference] = get_args(Reference),
 ) -> Iterator[tuple[LearnedDepth, list[CameraFit]]]:
     """Predict the depth of frames, ``batch`` images at a time, and fit it to their geometry.
 
-    Each camera is fitted to the first reference of ``wanted`` with enough points.
+    Each camera is fitted to the first reference of ``wanted`` with enough points: (P, 3) points of the frame, its depth
+    from motion at the size of ``motion_camera``, or the road without labelled objects (B, 7).
     """
     images = {(n, k): _pinhole_image(f.rig[k], f.images[k]) for n, f in enumerate(frames) for k in range(len(f.rig))}
     predictions: dict[tuple[int, int], Layer] = {}
@@ -145,16 +137,17 @@ def measured_pixels(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray
     return (row[nearest], column[nearest]), z[seen][nearest]
 
 
-def _references(frame: DepthInputs, k: int, seen: BoolArray) -> Iterator[tuple[Reference, Any, FloatArray]]:
+def _references(frame: Frame, k: int, seen: BoolArray) -> Iterator[tuple[Reference, Any, FloatArray]]:
     """Measurements that a camera may be fitted to: their name, pixels (rows, columns) and z-depths."""
     camera = motion_camera(frame.rig[k])
     if frame.points is not None:
         pixels, depth_m = measured_pixels(camera, frame.points)
         ask = seen[pixels]
         yield "LiDAR", tuple(index[ask] for index in pixels), depth_m[ask]
-    if frame.motion is not None:
-        pixels = np.nonzero(seen & (frame.motion.depth_m[k] > 0))
-        yield "motion", pixels, frame.motion.depth_m[k][pixels].astype(float)
+    if MOTION_KEY in frame.depth:
+        moved_m = frame.depth[MOTION_KEY][k]
+        pixels = np.nonzero(seen & (moved_m > 0))
+        yield "motion", pixels, moved_m[pixels].astype(float)
     rays, _ = camera.unproject(camera.pixel_grid())
     q = plane_inverse_distance(camera.center_m, rays, frame.rig.ground_z_m)
     road_m = np.divide(rays @ camera.cam2ego[:3, 2], q, out=np.full(q.shape, np.inf), where=q > 0)  # inf above it
@@ -190,7 +183,7 @@ def _feature(form: _Form, values: FloatArray) -> FloatArray:
 
 
 def _fit_camera(
-    frame: DepthInputs, k: int, prediction: Layer, output: Output, wanted: Sequence[Reference]
+    frame: Frame, k: int, prediction: Layer, output: Output, wanted: Sequence[Reference]
 ) -> tuple[Layer, CameraFit]:
     """The depth map of a frame's camera and its fit; 0 everywhere if it is declined."""
     values, seen = _sampled(frame.rig[k], prediction)

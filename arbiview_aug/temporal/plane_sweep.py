@@ -137,7 +137,7 @@ class SweptImage:
         The other image is in the same ego frame.
         """
         from arbiview_aug.cameras.kernels import LENS_CODES
-        from arbiview_aug.temporal.kernels import NODE_PX, match_walls
+        from arbiview_aug.temporal.kernels import match_walls
 
         h, w = self.camera.size
         kind, positions = LENS_CODES.get(other.camera.lens, -1), np.zeros((0, 2, h, w), np.float32)
@@ -149,12 +149,9 @@ class SweptImage:
             K = other.camera.K.astype(np.float32)
             A, offset = K @ A, K @ offset
         rays = (A @ self.rays.reshape(3, -1)).reshape(3, h, w)
-        surfaces = rays, self.road, self.horizontal
-        y, x = (np.minimum(np.arange(0, n + NODE_PX - 1, NODE_PX), n - 1) for n in (h, w))
-        nodes = tuple(np.ascontiguousarray(part[..., y[:, None], x]) for part in surfaces)
         costs = np.empty((h, len(walls), w), np.uint16)
         walls = np.ascontiguousarray(walls)  # another layout would be compiled, too
-        match_walls(*surfaces, nodes, self.windows, walls, offset, lens, other.quads, costs)
+        match_walls(rays, self.road, self.horizontal, self.windows, walls, offset, lens, other.quads, costs)
         return costs
 
 

@@ -25,7 +25,7 @@ from arbiview_aug.cli import doctor, parallel
 from arbiview_aug.cli.parsers import parser_of
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.errors import OutputError
-from arbiview_aug.generator.training.config import CONFIGS
+from arbiview_aug.generator.config import CONFIGS
 from arbiview_aug.render.plan import PRESETS
 from arbiview_aug.scene.scene import GEOMETRIES
 from tests.helpers import latin, street_sample

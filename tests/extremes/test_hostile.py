@@ -34,8 +34,8 @@ from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.depth_folder import DepthFolder
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.config import TrainConfig
 from arbiview_aug.generator.generator import read_checkpoint, write_checkpoint
-from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.trainer import RunState
 from arbiview_aug.image_ops import Memory
 from arbiview_aug.sample.batching import is_readable

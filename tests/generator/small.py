@@ -10,8 +10,7 @@ import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.config import GeneratorConfig, UNetConfig
-from arbiview_aug.generator.training.config import LossConfig, TrainConfig
+from arbiview_aug.generator.config import GeneratorConfig, LossConfig, TrainConfig, UNetConfig
 from arbiview_aug.generator.training.pseudo_views import Frames
 from tests import helpers
 

@@ -21,7 +21,7 @@ from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator, load_inpainter
-from arbiview_aug.inpaint import Black, CompletedLoader, NetworkInpainter, PipelineInpainter, TorchScriptInpainter
+from arbiview_aug.inpaint import Black, NetworkInpainter, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.inpaint.inpainter import RADIUS_PX, telea
 from arbiview_aug.inpaint.networks import Window, drawn, packed, windows
 from arbiview_aug.render.rendered import Views
@@ -139,7 +139,7 @@ def test_a_script_fills_a_frame_and_a_batch(lama: Path, drive: SyntheticDrive) -
         assert (alone[-1]["images"][:, 0][wide(alone[-1])] == 255).all()
     alone_calls = len(calls)
     loader = DataLoader(RetargetedDataset(drive, black), batch_size=2, collate_fn=collate)
-    (batch,) = CompletedLoader(loader, filler)
+    (batch,) = map(filler.complete_batch, loader)
     for k, one in enumerate(alone):
         assert torch.equal(batch["generated"][k], one["generated"])
         seen = one["coverage"][:, None].expand_as(one["images"])
@@ -225,14 +225,14 @@ def test_a_pipeline_from_disk_completes_frames_and_batches(pipeline: Path) -> No
     seen = [
         RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources", "confidence")))(frame) for frame in frames
     ]
-    filler = PipelineInpainter.from_pretrained(pipeline, size=128, steps=1)
+    filler = PipelineInpainter(pipeline, size=128, steps=1)
     pixels = watched(filler)
     retarget = RigRetarget(target, holes=filler)
     alone = retarget(frames[0])
     assert_completed(alone, seen[0])
     assert 0 < len(pixels) <= 2 and sum(pixels) <= 0.25 * alone["generated"].numel()
     loader = DataLoader(seen, batch_size=2, collate_fn=collate)  # type: ignore[arg-type]
-    (batch,) = CompletedLoader(loader, filler)
+    (batch,) = map(filler.complete_batch, loader)
     for k, one in enumerate(seen):
         assert_completed({key: batch[key][k] for key in ("images", "coverage", "generated")}, one)
 
@@ -241,7 +241,7 @@ def test_a_pipeline_from_disk_completes_frames_and_batches(pipeline: Path) -> No
 def test_a_pipeline_fills_six_views_the_same_way_each_time(pipeline: Path) -> None:
     drive = SyntheticDrive(demo_source_rig((40, 64)), num_frames=1)
     target = drive.rig.shifted(z_m=0.5)
-    filler = PipelineInpainter.from_pretrained(pipeline, size=64, steps=2, seed=3)
+    filler = PipelineInpainter(pipeline, size=64, steps=2, seed=3)
     assert (filler.multiple, filler.size, filler.device.type) == (2, 64, "cpu")
     retarget = RigRetarget(target, holes=filler)
     seen = RigRetarget(target, holes="black")(drive[0])
@@ -283,7 +283,7 @@ def test_what_is_no_network_is_refused(lama: Path, tmp_path: Path) -> None:
         TorchScriptInpainter(broken)
     (tmp_path / "empty").mkdir()
     with pytest.raises(GeneratorError, match="expected an inpainting pipeline of diffusers"):
-        PipelineInpainter.from_pretrained(tmp_path / "empty")
+        PipelineInpainter(tmp_path / "empty")
     with pytest.raises(GeneratorError, match="expected a generator's folder"):
         load_inpainter(tmp_path / "empty")
     assert isinstance(load_inpainter(lama), TorchScriptInpainter)
@@ -355,13 +355,15 @@ def test_windows_of_all_sizes_are_drawn_whole() -> None:
     hole = holes(0, (256, 704), "specks")
     cut = [Window(0, 0, 0, hole[:100, :200]), Window(0, 100, 0, hole[100:190, :250])]
     cut += [Window(0, 0, 300, hole[:80, 300:350]), Window(0, 150, 400, hole[150:200, 400:420])]
-    (canvas,) = packed(cut, 256, 8)
-    pixels, marks = drawn(canvas, [view], [hole])
-    for window, top, left in canvas.windows:
-        h, w = window.fills.shape
-        at = np.s_[..., top : top + h, left : left + w]
-        np.testing.assert_array_equal(marks[at], window.fills)
-        np.testing.assert_array_equal(pixels[at], window.of(view) * ~window.fills)
+    canvases = packed(cut, 256)
+    assert sum(map(len, canvases)) == len(cut)
+    for canvas in canvases:
+        drawing = drawn(canvas, [view], [hole], 8)
+        for window, top, left in canvas:
+            h, w = window.fills.shape
+            *pixels, marks = drawing[:, top : top + h, left : left + w]
+            np.testing.assert_array_equal(marks, window.fills)
+            np.testing.assert_array_equal(pixels, window.of(view) * ~window.fills)
 
 
 # --- telea's inpainting of holes --------------------------------------------------------------------------------------

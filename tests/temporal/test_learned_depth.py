@@ -12,7 +12,9 @@ import torch
 
 from arbiview_aug import Rig
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig
-from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, fit_depth, learned_depth
+from arbiview_aug.sample.frame import Frame
+from arbiview_aug.sample.inputs import MOTION_KEY
+from arbiview_aug.temporal.learned_depth import CameraFit, fit_depth, learned_depth
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.helpers import camera
 
@@ -59,13 +61,13 @@ def oracle(form: Callable[[np.ndarray], np.ndarray], output: Any = None, assumed
     )
 
 
-def inputs(**changes: Any) -> DepthInputs:
+def inputs(**changes: Any) -> Frame:
     sample, _ = street()
     points, boxes = sample["points"].numpy().astype(float), sample["boxes_3d"].numpy().astype(float)
-    return DepthInputs(RIG, list(sample["images"]), **({"points": points, "boxes": boxes} | changes))
+    return Frame(tuple(sample["images"]), RIG, **({"points": points, "boxes": boxes} | changes))
 
 
-def depth_of(model: Oracle, frame: DepthInputs, **settings: Any) -> tuple[MotionDepth, list[CameraFit]]:
+def depth_of(model: Oracle, frame: Frame, **settings: Any) -> tuple[MotionDepth, list[CameraFit]]:
     (one,) = learned_depth(model, [frame], **({"batch": 2} | settings))
     return one
 
@@ -95,7 +97,7 @@ def test_an_affine_change_and_another_focal_length_come_back(form: str, referenc
     """Within 2 % of the truth; the road is all that a fit needs."""
     true = street()[1].depth_m.numpy()
     motion = MotionDepth(tuple(np.where(true < 60, true, 0).astype(np.float32)), "")
-    depth, fits = depth_of(oracle(*FORMS[form]), inputs(motion=motion), wanted=[reference])
+    depth, fits = depth_of(oracle(*FORMS[form]), inputs(depth={MOTION_KEY: motion.depth_m}), wanted=[reference])
     assert [fit.reference for fit in fits] == [reference] * 2 and not any(fit.declined for fit in fits)
     assert np.quantile(errors(depth), 0.99) < 0.02
     assert "oracle, revision 1, licence mit" in str(depth) and f"of {reference}, residual 0." in str(depth)
@@ -145,7 +147,7 @@ def test_a_camera_of_which_nothing_is_known_is_declined() -> None:
     up = camera("up", size=(96, 128), horizontal_fov_deg=40.0, position_m=(0, 0, 1.5)).turned(pitch_deg=60)
     image = torch.zeros(3, 96, 128, dtype=torch.uint8)
     model = Oracle({image.numpy().tobytes(): np.ones((96, 128))}, lambda z: z, "depth")
-    depth, (fit,) = depth_of(model, DepthInputs(Rig([up]), [image]))
+    depth, (fit,) = depth_of(model, Frame((image,), Rig([up])))
     assert fit.declined == "fewer than 50 points of LiDAR, motion, road" and not depth.density
 
 
@@ -164,7 +166,7 @@ def test_fisheye_images_are_shown_as_pinhole_ones() -> None:
             return [inverse.astype(np.float32) for _ in images]
 
     image = torch.rand(3, 96, 128)
-    depth, (fit,) = depth_of(Road({}, lambda z: z, "inverse"), DepthInputs(Rig([lens]), [image]))
+    depth, (fit,) = depth_of(Road({}, lambda z: z, "inverse"), Frame((image,), Rig([lens])))
     rays, _ = lens.unproject(lens.pixel_grid())
     true = np.where(rays[..., 2] < -0.1, -1.5 / np.minimum(rays[..., 2], -1e-3) * rays[..., 0], np.inf)
     known = (depth.depth_m[0] > 0) & np.isfinite(true)

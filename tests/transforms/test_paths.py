@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, default_collate
 from arbiview_aug import Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator
-from arbiview_aug.inpaint import CompletedLoader, Inpainter, Telea
+from arbiview_aug.inpaint import Inpainter, Telea
 from tests.generator.small import ring
 from tests.helpers import assert_same_to_a_level
 
@@ -80,10 +80,8 @@ class _Retargeted(torch.utils.data.Dataset[Any]):
 def test_batches_are_completed_as_samples_are(generator: Generator, workers: int) -> None:
     """As each alone by ``complete_batch``; what holes lie behind, which ``RigRetarget`` knows, no batch says."""
     inpainter = Diffusion(generator, steps=2)
-    completed = CompletedLoader(loader(workers), inpainter)
-    assert len(completed) == 2
     alone = RigRetarget(TARGET, keys=SampleKeys(extra=("sources", "confidence")))
-    for b, batch in enumerate(completed):
+    for b, batch in enumerate(map(inpainter.complete_batch, loader(workers))):
         assert "sources" not in batch and batch["images"].dtype == torch.uint8
         for k in range(2):
             one = inpainter.complete_batch(alone(a_sample(f"frame {2 * b + k}", 2 * b + k)))
@@ -130,9 +128,9 @@ def test_frames_of_a_batch_share_the_denoisers_calls(generator: Generator) -> No
 
 def test_one_sample_and_no_generator() -> None:
     out = RigRetarget(TARGET, keys=SampleKeys(extra=("sources", "confidence")))(a_sample())
-    done = CompletedLoader([out], Telea())
+    done = Telea().complete_batch(out)
     inpainted = RigRetarget(TARGET, holes="telea")(a_sample())
-    assert torch.equal(next(iter(done))["images"], inpainted["images"])
+    assert torch.equal(done["images"], inpainted["images"])
 
 
 @pytest.mark.parametrize(
@@ -154,8 +152,6 @@ def test_what_an_inpainter_made_is_checked(made: Callable[[Any], Any]) -> None:
 
     with pytest.raises(GeneratorError, match=r"Own\.inpaint: expected images as its views, torch.uint8 \(3, .*, got"):
         RigRetarget(TARGET, holes=Own())(a_sample())
-    with pytest.raises(ValueError, match=r"inpainter: expected an Inpainter, such as Diffusion\(generator\), got str"):
-        CompletedLoader([], "telea")  # type: ignore[arg-type]
 
 
 def test_an_inpainter_that_writes_into_its_views_changes_holes_alone() -> None:

@@ -18,9 +18,8 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.files import open_regular
 from arbiview_aug.generator.completion import encoded
 from arbiview_aug.generator.conditioning import pooled
-from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
+from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig, GeoMode, TrainConfig
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows, noise_schedule
-from arbiview_aug.generator.training.config import GeoMode, TrainConfig
 from arbiview_aug.generator.training.pseudo_views import Batch
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, on which VGG16 was trained

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch.utils._pytree import tree_map
 from torch.utils.data import Dataset, get_worker_info
 
 from arbiview_aug.cameras.camera import Camera
@@ -31,11 +32,10 @@ from arbiview_aug.datasets.registry import READERS, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.favs.renderer import as_rendered, render_paper
-from arbiview_aug.generator.attention import joined, mapped
+from arbiview_aug.generator.attention import joined
 from arbiview_aug.generator.completion import unit, valid_pixels
 from arbiview_aug.generator.conditioning import SOURCES_PER_TARGET, Branches, frame_geometry
-from arbiview_aug.generator.config import GeneratorConfig
-from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
+from arbiview_aug.generator.config import GeneratorConfig, PseudoQuality, PseudoViewConfig
 from arbiview_aug.image_ops import resized
 from arbiview_aug.inpaint.continued import Continue
 from arbiview_aug.inpaint.inpainter import seeded
@@ -145,7 +145,8 @@ class Batch(NamedTuple):
     tokens: tuple[str, ...]  # names of the items
 
     def to(self, device: torch.device | str) -> Batch:
-        return Batch(*mapped(lambda tensor: tensor.to(device, non_blocking=True), self[:-1]), self.tokens)
+        tensors: Any = tree_map(lambda tensor: tensor.to(device, non_blocking=True), self[:-1])
+        return Batch._make((*tensors, self.tokens))
 
     @property
     def holes(self) -> torch.Tensor:

@@ -27,8 +27,8 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, OutputError, TrainingError, one_line, shown
 from arbiview_aug.generator.completion import denoised, shown_condition
 from arbiview_aug.generator.conditioning import pooled
+from arbiview_aug.generator.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.generator import FILE, Generator, read_checkpoint, write_checkpoint
-from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.losses import Perceptual, Step, draw, load_perceptual
 from arbiview_aug.generator.training.pseudo_views import Batch, Frames, PseudoViews, collate, open_frames
 from arbiview_aug.inpaint.inpainter import digest_of

@@ -13,9 +13,8 @@ import torch
 from arbiview_aug.__main__ import main
 from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.generator import Diffusion, Generator, load_inpainter
-from arbiview_aug.generator.config import GeneratorConfig, from_plain
+from arbiview_aug.generator.config import CONFIGS, GeneratorConfig, TrainConfig, from_plain, overridden
 from arbiview_aug.generator.training import pseudo_views, trainer
-from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.pseudo_views import Frames, collate, open_frames
 from arbiview_aug.generator.training.trainer import Trainer, hole_psnr, sampled
 from arbiview_aug.transforms.rig_retarget import RigRetarget

@@ -13,8 +13,8 @@ from torch import nn
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
+from arbiview_aug.generator.config import LossConfig, TrainConfig
 from arbiview_aug.generator.denoiser import REGRESSION, Rows, noise_schedule
-from arbiview_aug.generator.training.config import LossConfig, TrainConfig
 from arbiview_aug.generator.training.losses import (
     Draws,
     ForwardProcess,

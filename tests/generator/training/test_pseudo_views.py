@@ -13,7 +13,7 @@ from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import TrainingError
-from arbiview_aug.generator.training.config import CONFIGS, PseudoViewConfig
+from arbiview_aug.generator.config import CONFIGS, PseudoViewConfig
 from arbiview_aug.generator.training.pseudo_views import Batch, Frames, PseudoViews, collate
 from arbiview_aug.inpaint.inpainter import seeded
 from arbiview_aug.transforms.rig_retarget import RigRetarget

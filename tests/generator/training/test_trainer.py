@@ -19,9 +19,9 @@ import torch
 from arbiview_aug.errors import OutputError, TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator import generator as checkpoints
+from arbiview_aug.generator.config import LossConfig
 from arbiview_aug.generator.generator import FILE, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.training import trainer
-from arbiview_aug.generator.training.config import LossConfig
 from arbiview_aug.generator.training.trainer import Trainer, learning_rate
 from tests.generator.small import config, frames
 
