@@ -87,7 +87,7 @@ class DepthFolder:
             with np.load(BytesIO(read_bytes(path, _MOST_BYTES)), allow_pickle=False) as file:
                 arrays: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(arrays[f"depth_{k:02}"].astype(np.float32) for k in range(len(arrays["K"])))
-            found = _KINDS[str(arrays.get("kind", "motion"))](depth, str(arrays["words"]))
+            found = _KINDS[str(arrays["kind"])](depth, str(arrays["words"]))
             misfit = _misfit(arrays, token, rig, depth)
             origin: list[str] = arrays["neighbours"].tolist()
         except (*BROKEN_ARRAY, KeyError, TypeError, OverflowError) as error:
@@ -147,7 +147,7 @@ def _calibration(rig: Rig) -> dict[str, Any]:
 
 def _misfit(arrays: Mapping[str, Any], token: str, rig: Rig, depth: tuple[Layer, ...]) -> str | None:
     """Expected and actual frame, format, rig, image size or calibration of a file; None if it fits."""
-    recorded, number = str(arrays.get("token", token)), int(arrays["format"])  # older files name no token
+    recorded, number = str(arrays["token"]), int(arrays["format"])
     if recorded != token:
         return f"frame {token!r}, got that of frame {recorded!r}; "
     if number != _FORMAT:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import operator
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -25,7 +22,6 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce, is_number, is_whole
 from arbiview_aug.datasets.image_io import check_reduce
 from arbiview_aug.errors import ArbiviewError, DataError, shown, warn
-from arbiview_aug.files import read_text
 from arbiview_aug.sample.neighbours import STILL_M
 
 Direction = Literal["both", "past", "future"]
@@ -41,13 +37,8 @@ def is_converted(root: Path) -> bool:
 
 def warn_of_unfinished(root: Path, found: int) -> None:
     """Warn of a conversion that is not finished, with the number of frames found."""
-    if not is_converted(root) or (root / CONVERSION_FOLDER / FINISHED_FILE).is_file():
-        return
-    count = str(found)
-    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):  # ``convert`` tells what is wrong with it
-        begun = json.loads(read_text(root / CONVERSION_FOLDER / BEGUN_FILE, 1 << 28))  # all names of 2 million frames
-        count += f" of {len(begun['source']['frames'])}"
-    warn(f"{root}: unfinished conversion: {count} frames; run convert again")
+    if is_converted(root) and not (root / CONVERSION_FOLDER / FINISHED_FILE).is_file():
+        warn(f"{root}: unfinished conversion: {found} frames so far; run convert again")
 
 
 def checked_index(index: Any, count: int) -> int:
@@ -59,31 +50,6 @@ def checked_index(index: Any, count: int) -> int:
         raise TypeError(f"index: expected a whole number, got {type(index).__name__}; {fix}") from None
     except IndexError:
         raise IndexError(f"index: expected one of {count} samples, got {index}") from None
-
-
-class Recording(Dataset[dict[str, Any]]):
-    """Base class of the readers: samples on disk, each with a token."""
-
-    root: Path  # folder of the data
-    tokens: list[str]  # unique name of each sample, in order
-    load_points: bool  # whether to read the LiDAR's points
-
-    @cached_property
-    def _index(self) -> dict[str, int]:
-        return {token: k for k, token in enumerate(self.tokens)}
-
-    def __len__(self) -> int:
-        return len(self.tokens)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({len(self)} samples in {self.root})"
-
-    def by_token(self, token: str) -> dict[str, Any]:
-        """The sample with this token; DataError if there is none."""
-        if not isinstance(token, str) or token not in self._index:
-            got = f"{shown(token)}; they are {', '.join(self.tokens[:3])} …"
-            raise DataError(f"{self.root}: expected the token of one of {len(self)} samples, got {got}")
-        return self[self._index[token]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,47 +89,13 @@ def check_neighbours(value: Any) -> None:
         raise TypeError(f"neighbours: expected Neighbours or None, got {type(value).__name__}")
 
 
-class Drive:
-    """Distance travelled by a vehicle, from its positions (F, 3) in the world, in recording order.
-
-    ``parts`` (F,) are non-decreasing numbers of uninterrupted parts; neighbours share their part. Pose jitter of a
-    standing vehicle does not count as travel.
-    """
-
-    def __init__(self, positions_m: FloatArray, parts: npt.NDArray[np.int64]) -> None:
-        total_m, distances_m, last = 0.0, [], None
-        for position in positions_m.tolist():
-            step_m = 0.0 if last is None else math.dist(last, position)
-            if last is None or step_m >= STILL_M:
-                last, total_m = position, total_m + step_m
-            distances_m.append(total_m)
-        self._travelled_m, self._parts = np.array(distances_m), parts
-
-    def neighbours(self, index: int, wanted: Neighbours) -> list[int]:
-        """Indices of a frame's neighbours, nearest first in each direction."""
-        first, end = (int(k) for k in np.searchsorted(self._parts, self._parts[index] + [0, 1]))
-        travelled_m, rows = self._travelled_m[first:end], list[int]()
-        for sign in wanted.signs:
-            for k in range(1, wanted.count + 1):
-                # 1 mm of tolerance: the poses of a standing vehicle jitter.
-                target_m = self._travelled_m[index] + sign * (k * wanted.step_m - 1e-3)
-                at = first + int(np.searchsorted(travelled_m, target_m, "left" if sign > 0 else "right")) - (sign < 0)
-                if first <= at < end and at not in rows:
-                    rows.append(at)
-        return rows
-
-
 def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, where: str) -> npt.NDArray[np.int64]:
     """(F,) parts of a drive with frames ``names``; a new one begins, with a warning, where the clock goes back."""
     goes_back = [times_s is not None and times_s[after] <= times_s[before] for before, after in pairwise(names)]
     for k in np.flatnonzero(goes_back).tolist():
-        warn(clock_message(where, names[k], names[k + 1]))
+        back = f"the clock goes back from frame {names[k]!r} to {names[k + 1]!r}"
+        warn(f"{where}: {back}: they are no neighbours")
     return np.cumsum([0, *goes_back], dtype=np.int64)[: len(names)]
-
-
-def clock_message(where: str, before: str, after: str) -> str:
-    """Warning for a clock that goes back from one frame to the next."""
-    return f"{where}: the clock goes back from frame {before!r} to {after!r}: they are no neighbours"
 
 
 def camera_fields(rig: Rig, images: Any, token: str) -> dict[str, Any]:
@@ -172,35 +104,91 @@ def camera_fields(rig: Rig, images: Any, token: str) -> dict[str, Any]:
     return {"images": images, "rig": rig, "K": K, "cam2ego": cam2ego, "token": token}
 
 
-class WritableRecording(Recording, ABC):
-    """Base class of readers that ``convert`` has a writer for; ``FrameFolder`` explains the options that all have."""
+class Drive:
+    """Distance travelled by a vehicle, from its positions (F, 3) in the world, in recording order.
 
-    def __init__(self, root: str | Path, reduce: Reduce, load_points: bool, neighbours: Neighbours | None) -> None:
+    ``rows`` (F,) number the frames. ``parts`` (F,) are non-decreasing numbers of uninterrupted parts; neighbours share
+    their part. Pose jitter of a standing vehicle does not count as travel.
+    """
+
+    def __init__(self, rows: npt.ArrayLike, positions_m: FloatArray, parts: npt.NDArray[np.int64]) -> None:
+        total_m, distances_m, last = 0.0, [], None
+        for position in positions_m.tolist():
+            step_m = 0.0 if last is None else math.dist(last, position)
+            if last is None or step_m >= STILL_M:
+                last, total_m = position, total_m + step_m
+            distances_m.append(total_m)
+        self._rows, self._travelled_m, self._parts = np.array(rows, np.int64), np.array(distances_m), parts
+
+    def neighbours(self, row: int, wanted: Neighbours) -> list[int]:
+        """Rows of a frame's neighbours, nearest first in each direction; none of a frame that is not in the drive."""
+        places = list[int]()
+        for index in np.flatnonzero(self._rows == row).tolist():
+            first, end = (int(k) for k in np.searchsorted(self._parts, self._parts[index] + [0, 1]))
+            travelled_m = self._travelled_m[first:end]
+            for sign in wanted.signs:
+                for k in range(1, wanted.count + 1):
+                    # 1 mm of tolerance: the poses of a standing vehicle jitter.
+                    target_m = self._travelled_m[index] + sign * (k * wanted.step_m - 1e-3)
+                    at = first + int(np.searchsorted(travelled_m, target_m, "left" if sign > 0 else "right"))
+                    at -= sign < 0
+                    if first <= at < end and at not in places:
+                        places.append(at)
+        return self._rows[places].tolist()
+
+
+class Recording(Dataset[dict[str, Any]]):
+    """Base class of the readers: samples on disk, each with a token; ``FrameFolder`` explains the options."""
+
+    root: Path  # folder of the data
+    tokens: list[str]  # unique name of each sample, in order
+    load_points: bool  # whether to read the LiDAR's points
+    writer: str | None = None  # subclass of ``Writer`` as ``module:Class``; None if ``convert`` has none
+
+    def __init__(
+        self, root: str | Path, reduce: Reduce = 1, load_points: bool = True, neighbours: Neighbours | None = None
+    ) -> None:
         check_reduce(reduce)
         check_neighbours(neighbours)
         self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
 
-    @abstractmethod
-    def files(self, index: int) -> list[Path]:
-        """All files that a sample is read from."""
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {token: k for k, token in enumerate(self.tokens)}
 
-    def _neighbours(self, drive: Drive, place: int) -> list[LazyFrame]:
-        """Neighbours of the frame at a place of a drive; broken ones raise on access."""
+    def __len__(self) -> int:
+        return len(self.tokens)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)} samples in {self.root})"
+
+    def by_token(self, token: str) -> dict[str, Any]:
+        """The sample with this token; DataError if there is none."""
+        if not isinstance(token, str) or token not in self._index:
+            got = f"{shown(token)}; they are {', '.join(self.tokens[:3])} …"
+            raise DataError(f"{self.root}: expected the token of one of {len(self)} samples, got {got}")
+        return self[self._index[token]]
+
+    def files(self, index: int) -> list[Path]:
+        """All files that a sample is read from, for ``convert``."""
+        raise NotImplementedError
+
+    def _neighbours(self, drive: Drive, row: int) -> list[LazyFrame]:
+        """Neighbours of a row of the drive; broken ones raise on access."""
         frames: list[LazyFrame] = []
-        for k in drive.neighbours(place, self.neighbours) if self.neighbours else ():
+        for k in drive.neighbours(row, self.neighbours or Neighbours()):
             try:
                 frames.append(self._neighbour(k))
             except ArbiviewError as error:
                 frames.append(LazyFrame({"token": self._token(k)}, dict, error=error))
         return frames
 
-    def _neighbour(self, place: int) -> LazyFrame:
-        """The frame at a place of the drive; its images and points are read on access."""
-        raise NotImplementedError  # not abstract: readers without neighbours do not need it
+    def _neighbour(self, row: int) -> LazyFrame:
+        """The frame of a row of the drive; its images and points are read on access."""
+        raise NotImplementedError
 
-    def _token(self, place: int) -> str:
-        """Token of the frame at a place of the drive."""
-        return self.tokens[place]
+    def _token(self, row: int) -> str:
+        return self.tokens[row]
 
 
 class LazyFrame(Mapping[str, Any]):

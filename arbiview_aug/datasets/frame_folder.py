@@ -8,7 +8,8 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
+from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from arbiview_aug.datasets.drive import (
     Drive,
     LazyFrame,
     Neighbours,
-    WritableRecording,
+    Recording,
     camera_fields,
     checked_index,
     parts_of_clock,
@@ -211,7 +212,7 @@ class _Frame:
         return torch.from_numpy(array if array.size else array.reshape(0, 7))
 
 
-class FrameFolder(WritableRecording):
+class FrameFolder(Recording):
     """A folder that is a frame (it has ``calib.json``), or a folder of such folders, in the order of their names.
 
     ``docs/formats.md`` describes ``calib.json``, the points (a float .npy of shape (P, >=3), x y z first, in the ego
@@ -241,6 +242,8 @@ class FrameFolder(WritableRecording):
         CalibrationError: On access, an impossible calibration, by camera.
     """
 
+    writer = "arbiview_aug.cli.convert.writer:FrameFolders"
+
     def __init__(
         self,
         root: str | Path,
@@ -264,11 +267,11 @@ class FrameFolder(WritableRecording):
         self.tokens = [frame.name for frame in self._frames]
         warn_of_unfinished(self.root, len(self))
         self._last_rig: tuple[str, Rig] | None = None
+        self._masks: dict[tuple[str, float], BoolArray] = {}
         self._rims: dict[tuple[Any, ...], BoolArray | None] = {}
         self._times_s, order = _read_sequence(self.root, self._index)
         self._order = dict.fromkeys(order)
         self._warn = WarnOnce()
-        self._drive_names: list[str] = []
         self._drive = None if neighbours is None else self._find_drive()
 
     def files(self, index: int) -> list[Path]:
@@ -279,7 +282,8 @@ class FrameFolder(WritableRecording):
         return [path for path in (*paths, frame.points_file() if self.load_points else None) if path is not None]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        frame = self._frames[checked_index(index, len(self))].read()
+        index = checked_index(index, len(self))
+        frame = self._frames[index].read()
         rig = self._rig(frame)
         keys = "boxes_3d", "ego2world", "lidar", "lidars"
         for entries, read in ((frame.calib, keys), *((c, ("mask",)) for c in frame.cameras)):
@@ -292,8 +296,7 @@ class FrameFolder(WritableRecording):
         if frame.name in self._order:
             sample["scene_token"] = self.root.resolve().name
         if self._drive is not None:
-            names, name = self._drive_names, frame.name
-            sample["neighbours"] = self._neighbours(self._drive, names.index(name)) if name in names else []
+            sample["neighbours"] = self._neighbours(self._drive, index)
         return sample
 
     def truth(self, index: int) -> dict[str, Any] | None:
@@ -333,25 +336,23 @@ class FrameFolder(WritableRecording):
                     positions_m[name] = pose.numpy()[:3, 3]
             except ArbiviewError as error:
                 warn(f"{error}; this frame is no neighbour")
-        names = self._drive_names = list(positions_m)
+        names = list(positions_m)
         if len(names) < 2:
             found = "one" if names else "none"
             warn(f"{self.root}: neighbours: expected frames of a drive ({SEQUENCE_FILE} and ego2world), found {found}")
         times_s = self._times_s if all(name in self._times_s for name in names) else None
         parts = parts_of_clock(names, times_s, str(self.root / SEQUENCE_FILE))
-        return Drive(np.array(list(positions_m.values())).reshape(-1, 3), parts)
+        rows = [self._index[name] for name in names]
+        return Drive(rows, np.array(list(positions_m.values())).reshape(-1, 3), parts)
 
-    def _token(self, place: int) -> str:
-        return self._drive_names[place]
-
-    def _neighbour(self, place: int) -> LazyFrame:
-        frame = self._frames[self._index[self._token(place)]].read()
+    def _neighbour(self, row: int) -> LazyFrame:
+        frame = self._frames[row].read()
         fields = {"token": frame.name, "rig": self._rig(frame), **self._boxes_pose_time(frame)}
         fields |= frame.view_masks(self.reduce, ("coverage",))
         return LazyFrame(fields, partial(frame.images, self.reduce), frame.points if self.load_points else None)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_last_rig": None}
+        return {**self.__dict__, "_last_rig": None, "_masks": {}}
 
     def _rig(self, frame: _Frame) -> Rig:
         """The frame's rig; the last one itself if the calibration is the same."""
@@ -367,11 +368,21 @@ class FrameFolder(WritableRecording):
         last = self._last_rig  # read once, for threads
         if last is None or last[0] != key:
             rig = Rig.from_dict(data, where=frame.where)
-            clean = self.clean_masks
-            cameras = [_with_mask(camera, file, frame, clean) for camera, file in zip(rig, masks, strict=True)]
-            cameras = list(map(self._without_rim, cameras)) if clean else cameras
+            cameras = [self._with_mask(camera, file, frame) for camera, file in zip(rig, masks, strict=True)]
+            cameras = list(map(self._without_rim, cameras)) if self.clean_masks else cameras
             last = self._last_rig = key, reduced_rig(rig.with_cameras(cameras), self.reduce)
         return last[1]
+
+    def _with_mask(self, camera: Camera, path: Path | None, frame: _Frame) -> Camera:
+        if path is None:
+            return camera
+        key = os.path.realpath(path), _modified_s(path)
+        if (mask := self._masks.get(key)) is None:
+            mask = read_mask(str(path), path.parent, f"{frame.where}: camera {camera.name!r}")
+            mask = without_specks(mask) if self.clean_masks else mask
+            self._masks = {key: mask} if len(self._masks) >= _CACHED_MASKS else {**self._masks, key: mask}
+        with calibration_of(frame.where):
+            return replace(camera, mask=mask)
 
     def _without_rim(self, camera: Camera) -> Camera:
         """The camera with a mask of the rim that is dark in several frames, if it has no mask."""
@@ -424,37 +435,34 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
     return times_s, names
 
 
-def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) -> Camera:
-    if path is None:
-        return camera
-    try:
-        file = os.path.realpath(path)
-        mask = _cached_mask(file, clean, _modified_s(path))
-    except CalibrationError:
-        mask = read_mask(str(path), path.parent, f"{frame.where}: camera {camera.name!r}")  # again, in its frame's name
-    with calibration_of(frame.where):
-        return replace(camera, mask=mask)
-
-
 def _modified_s(path: Path) -> float:
     return os.path.getmtime(path) if os.path.isfile(path) else 0.0
 
 
-@lru_cache(maxsize=_CACHED_MASKS)
-def _cached_mask(path: str, clean: bool, modified_s: float) -> BoolArray:
-    mask = read_mask(path, Path(path).parent, "rig")
-    return without_specks(mask) if clean else mask
-
-
 def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:
     """Write a sample's uint8 images as JPEGs, its rig without masks, and its points, boxes and pose if it has them."""
-    rig: Rig = sample["rig"]
+    names = [{"file": f"{k:02}.jpg"} for k in range(len(sample["images"]))]
+    files = {name["file"]: encoded_image(image) for name, image in zip(names, sample["images"], strict=True)}
     folder.mkdir(parents=True, exist_ok=True)
-    calib = rig.to_dict()
-    for k, (entry, image) in enumerate(zip(calib["cameras"], sample["images"], strict=True)):
-        entry["file"] = f"{k:02}.jpg"
-        (folder / entry["file"]).write_bytes(encoded_image(image))
-    calib |= {key: sample[key].tolist() for key in ("boxes_3d", "ego2world") if key in sample}
+    for name, content in (files | frame_files(sample["rig"], names, sample)).items():
+        (folder / name).write_bytes(content)
+
+
+def frame_files(
+    rig: Rig, names: Sequence[Mapping[str, str]], sample: Mapping[str, Any], further: Mapping[str, Any] | None = None
+) -> dict[str, bytes]:
+    """A frame's points, and last its calibration with ``further`` entries, by their names in its folder.
+
+    ``names`` are those of each camera's image and masks by their key. Boxes, their names and the pose are the sample's.
+    """
+    calib, files = rig.to_dict(), {}
+    for entry, named in zip(calib["cameras"], names, strict=True):
+        entry |= named
     if "points" in sample:
-        np.save(folder / POINTS_FILE, sample["points"].numpy())
-    (folder / CALIBRATION_FILE).write_text(json.dumps(calib, indent=1))
+        np.save(file := BytesIO(), sample["points"].numpy())
+        files = {POINTS_FILE: file.getvalue()}
+    if "boxes_3d" in sample:  # JSON has no NaN
+        calib["boxes_3d"] = [[None if x != x else x for x in box] for box in sample["boxes_3d"].tolist()]
+    calib |= {"box_names": sample["box_names"]} if "box_names" in sample else {}
+    calib |= {"ego2world": sample["ego2world"].tolist()} if "ego2world" in sample else {}
+    return files | {CALIBRATION_FILE: json.dumps({**calib, **(further or {})}, indent=1).encode()}

@@ -17,27 +17,13 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import poses_from, rotation_from_quaternion
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, checked_index
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, Recording, camera_fields, checked_index
 from arbiview_aug.datasets.image_io import area_reduced, reduced_rig
 from arbiview_aug.datasets.lidar_files import checked_points
 from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, calibration_of, described
 from arbiview_aug.sample.batching import stacked
-
-LICENCES = {
-    "av2-sensor": "CC BY-NC-SA 4.0",
-    "nuscenes": "CC BY-NC-SA 4.0",
-    "nuplan": "CC BY-NC-SA 4.0",
-    "kitti360": "CC BY-NC-SA 3.0",
-    "wod-perception": "Waymo Dataset License Agreement for Non-Commercial Use",
-    "physical-ai-av": "NVIDIA Autonomous Vehicle Dataset License Agreement",
-    "ncore": "NVIDIA Autonomous Vehicle Dataset License Agreement",
-}
-"""Licences by ``LogMetadata.dataset``, as their publishers name them; the licence that came with the data decides."""
-
-NOT_SHARED = ("wod-perception", "physical-ai-av", "ncore")
-"""Data sets whose licences restrict who may be given derivatives."""
 
 _MEI_HALF_FOV_RAD, _MEI_ERROR_PX = np.deg2rad(95.0), 0.5
 _FTHETA_CONSTANT_PX = 0.01
@@ -78,7 +64,7 @@ class _Log:
         return self.pose(iteration, "imu_se3", "ego_state_se3")
 
 
-class Py123dDataset(WritableRecording):
+class Py123dDataset(Recording):
     """The iterations of py123d's logs, in the order of their folders and times.
 
     A sample is a dict, everything in the ego frame (py123d's IMU frame) at the iteration's time: ``images`` (N, 3, h,
@@ -104,6 +90,8 @@ class Py123dDataset(WritableRecording):
         DataError: No log, or one that py123d cannot read.
         CalibrationError: A camera whose lens no lens here approximates.
     """
+
+    writer = "arbiview_aug.cli.convert.writer:LogFrames"
 
     def __init__(
         self,
@@ -141,11 +129,6 @@ class Py123dDataset(WritableRecording):
         self.tokens = [f"{self._logs[n].folder.parent.name}-{self._logs[n].folder.name}-{us}" for n, _, us in frames]
         self._drive = None if neighbours is None else self._find_drive()
 
-    @property
-    def licences(self) -> dict[str, str]:
-        """Licences by the names of the data sets that the logs were made of."""
-        return {name: LICENCES.get(name, "unknown") for name in sorted({log.dataset for log in self._logs})}
-
     def time_s(self, index: int) -> float:
         return 1e-6 * self._frames[index][2]
 
@@ -169,7 +152,7 @@ class Py123dDataset(WritableRecording):
         if self.load_points and (points := _points(log, iteration, token)) is not None:
             sample["points"] = points
         if self._drive is not None:
-            sample["neighbours"] = self._neighbours(self._drive, self._posed.index(index))
+            sample["neighbours"] = self._neighbours(self._drive, index)
         return sample
 
     def _fields(self, index: int) -> dict[str, Any]:
@@ -200,15 +183,10 @@ class Py123dDataset(WritableRecording):
             with _reading(log.folder):
                 if (pose := log.ego2world(iteration)) is not None:
                     poses[index] = pose[:3, 3]
-        self._posed = list(poses)
         parts = np.array([self._frames[index][0] for index in poses], np.int64)
-        return Drive(np.array(list(poses.values())).reshape(-1, 3), parts)
+        return Drive(list(poses), np.array(list(poses.values())).reshape(-1, 3), parts)
 
-    def _token(self, place: int) -> str:
-        return self.tokens[self._posed[place]]
-
-    def _neighbour(self, place: int) -> LazyFrame:
-        index = self._posed[place]
+    def _neighbour(self, index: int) -> LazyFrame:
         log, iteration = self._at(index)
         with _reading(log.folder):
             fields = self._fields(index)

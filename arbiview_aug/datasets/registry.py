@@ -37,7 +37,6 @@ class Reader:
     recognises: Callable[[Path], bool]  # whether a folder is of this kind
     open: Callable[..., Recording]  # opens a folder, given ``reduce``, ``neighbours`` and its ``options``
     options: tuple[str, ...] = ()  # further options of ``open_data`` that it takes
-    writer: str | None = None  # subclass of ``Writer`` as ``module:Class``; None if ``convert`` has none
 
 
 READERS = {
@@ -46,7 +45,6 @@ READERS = {
         lambda root: (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")),
         lambda root, **options: imported("arbiview_aug.datasets.frame_folder:FrameFolder")(root, **options),
         options=("clean_masks",),
-        writer="arbiview_aug.cli.convert.frame_folders:FrameFolders",
     ),
     "nuscenes": Reader(
         "nuScenes root (with a folder of tables such as v1.0-mini)",
@@ -55,13 +53,11 @@ READERS = {
             "arbiview_aug.datasets.nuscenes.reader:NuScenesDataset"
         )(root, version or table_folders(root)[0], **options),
         options=("version", "clean_masks", "lidar_channel", "lidar_columns"),  # there are no masks to clean
-        writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
     ),
     "py123d": Reader(
         "folder of py123d's logs (with sync.arrow in it)",
         lambda root: bool(log_folders(root)),
         lambda root, **options: imported("arbiview_aug.datasets.py123d:Py123dDataset")(root, **options),
-        writer="arbiview_aug.cli.convert.frame_folders:LogFrames",
     ),
 }
 """Every kind of data set, by its name in ``KIND:PATH``; the first one that recognises a folder opens it."""
@@ -81,28 +77,6 @@ def data_name(data: str | Path) -> str:
 def kinds_of(root: Path) -> list[str]:
     """All kinds whose readers recognise a folder; empty for anything else."""
     return [kind for kind, reader in READERS.items() if os.path.isdir(root) and reader.recognises(root)]
-
-
-def find_reader(data: str | Path, kind: str | None = None, *, version: str | None = None) -> tuple[Path, Reader]:
-    """Find a data set's folder and its reader; arguments and errors as for ``open_data``."""
-    named, root = split_kind(data)
-    kind = kind or named
-    if kind is not None and kind not in READERS:
-        raise DataError(f"data {root}: expected a kind of {', '.join(READERS)}, got {kind!r}")
-    if not os.path.isdir(root):  # unlike Path.is_dir, False for a name that is too long
-        fix = f"; the kinds of KIND:PATH are {', '.join(READERS)}" if ":" in str(root) else ""
-        raise DataError(f"data {root}: expected a folder, found none{fix}")
-    kinds = kinds_of(root)
-    if kind is None and not kinds:
-        expected = " or ".join(f"a {reader.description}" for reader in READERS.values())
-        raise DataError(f"data {root}: expected {expected}, found none of them")
-    reader = READERS[kind or kinds[0]]
-    if version is not None and "version" not in reader.options:
-        raise DataError(f"data {root}: expected no version, which a {reader.description} has not, got {version!r}")
-    if kind is not None and kind not in kinds and version is None:  # a version names the folder of tables
-        instead = f"; it is a {READERS[kinds[0]].description}: {kinds[0]}:{root}" if kinds else ""
-        raise DataError(f"data {root}: expected a {reader.description}, found none{instead}")
-    return root, reader
 
 
 def open_data(
@@ -135,14 +109,28 @@ def open_data(
     Raises:
         DataError: There is no such folder, no reader fits it, an option is not for this kind, or it is empty.
     """
-    root, reader = find_reader(data, kind, version=version)
+    named, root = split_kind(data)
+    kind = kind or named
+    if kind is not None and kind not in READERS:
+        raise DataError(f"data {root}: expected a kind of {', '.join(READERS)}, got {kind!r}")
+    if not os.path.isdir(root):  # unlike Path.is_dir, False for a name that is too long
+        fix = f"; the kinds of KIND:PATH are {', '.join(READERS)}" if ":" in str(root) else ""
+        raise DataError(f"data {root}: expected a folder, found none{fix}")
+    kinds = kinds_of(root)
+    if kind is None and not kinds:
+        expected = " or ".join(f"a {reader.description}" for reader in READERS.values())
+        raise DataError(f"data {root}: expected {expected}, found none of them")
+    reader = READERS[kind or kinds[0]]
     options: dict[str, Any] = {"version": version, "clean_masks": clean_masks}
     options |= {"lidar_channel": lidar_channel, "lidar_columns": lidar_columns}
     options = {name: value for name, value in options.items() if value}
-    for name in options.keys() - {*reader.options}:  # the version is checked already
+    for name in options.keys() - {*reader.options}:
         fix = "; its calib.json states columns (docs/formats.md)" if name == "lidar_columns" else ""
         option = f"{name} (--{name.replace('_', '-')})"
         raise DataError(f"data {root}: expected no {option}, which a {reader.description} has not{fix}")
+    if kind is not None and kind not in kinds and version is None:  # a version names the folder of tables
+        instead = f"; it is a {READERS[kinds[0]].description}: {kinds[0]}:{root}" if kinds else ""
+        raise DataError(f"data {root}: expected a {reader.description}, found none{instead}")
     recording = reader.open(root, reduce=reduce, neighbours=neighbours, load_points=load_points, **options)
     if not recording.tokens:
         raise DataError(f"data {root}: expected samples, got none; check the copy of the data")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -17,8 +17,22 @@ from arbiview_aug.transforms.warm_up import compile_kernels
 Retarget = Callable[[Any], Any]
 
 
-class RetargetedDataset(Dataset[Any]):
-    """A map-style dataset whose samples pass through ``retarget``; batched access uses the dataset's ``__getitems__``.
+class _Retargeted:
+    """A dataset and the transform of its samples."""
+
+    dataset: Any
+    retarget: Retarget
+
+    def __len__(self) -> int:
+        return len(self.dataset)  # TypeError without one, as of the dataset itself
+
+    def set_epoch(self, epoch: int) -> None:
+        """Hand the epoch to the transform and to the dataset, where they have ``set_epoch``."""
+        _set_epoch(epoch, self.retarget, self.dataset)
+
+
+class RetargetedDataset(_Retargeted, Dataset[Any]):
+    """A map-style dataset whose samples pass through ``retarget``.
 
     Args:
         dataset: Map-style dataset.
@@ -33,24 +47,8 @@ class RetargetedDataset(Dataset[Any]):
         self.dataset = checked_map_style(dataset, type(self).__name__, fix)
         self.retarget = _checked_retarget(retarget, type(self).__name__)
 
-    def __len__(self) -> int:
-        return len(self.dataset)
-
-    def set_epoch(self, epoch: int) -> None:
-        """Hand the epoch to the transform and to the dataset, where they have ``set_epoch``."""
-        _set_epoch(epoch, self.retarget, self.dataset)
-
     def __getitem__(self, index: Any) -> Any:
         return _retargeted(self.retarget, self.dataset[index], index)
-
-    def __getitems__(self, indices: Sequence[Any]) -> list[Any]:
-        if not callable(getattr(self.dataset, "__getitems__", None)):
-            return [self[index] for index in indices]
-        samples = list(self.dataset.__getitems__(indices))
-        if len(samples) != len(indices):
-            where = f"{type(self.dataset).__name__}.__getitems__"
-            raise DataError(f"{where}: expected {len(indices)} samples, got {len(samples)}")
-        return [_retargeted(self.retarget, *pair) for pair in zip(samples, indices, strict=True)]
 
 
 class MixedDataset(Dataset[Any]):
@@ -97,7 +95,7 @@ class MixedDataset(Dataset[Any]):
         return (self.retargeted if torch.rand(()).item() < self.share else self.raw)[index]
 
 
-class RetargetedIterable(IterableDataset[Any]):
+class RetargetedIterable(_Retargeted, IterableDataset[Any]):
     """An iterable dataset whose samples pass through ``retarget``.
 
     Splitting the stream between workers is left to the dataset: one that does not look at
@@ -121,13 +119,6 @@ class RetargetedIterable(IterableDataset[Any]):
             raise SampleTypeError(f"{name}: expected a dataset that can be iterated again, got {got}")
         self.dataset = dataset
         self.retarget = _checked_retarget(retarget, name)
-
-    def __len__(self) -> int:
-        return len(self.dataset)  # TypeError without one, as of the dataset itself
-
-    def set_epoch(self, epoch: int) -> None:
-        """Hand the epoch to the transform and to the dataset, where they have ``set_epoch``."""
-        _set_epoch(epoch, self.retarget, self.dataset)
 
     def __iter__(self) -> Iterator[Any]:
         for number, sample in enumerate(self.dataset):

@@ -90,7 +90,10 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("convert --data frame --target waymo --output loop", "expected a folder, got a file or a link"),
         ("inspect large.yaml", r"a file of 23\.8 MiB, more than 1\.0 MiB"),
         *((f"check {name}", "expected at most 128 cameras, got 1[25].") for name in ("crowd", "few")),
-        ("convert --data frame --target waymo --output o --version v1.0-mini", "expected no version, which a frame f"),
+        (
+            "convert --data frame --target waymo --output o --version v1.0-mini",
+            r"no version \(--version\), which a frame f",
+        ),
         ("demo --holes diffusion", "argument --holes: diffusion needs --generator PATH: python -m arbiview_aug train"),
         ("evaluate --holes diffusion --generator no/no/no", "generator no/no/no: expected a folder of a generator"),
         ("evaluate --quality paper fast --geometry street", "quality paper knows infinity alone, got street"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 from contextlib import suppress
@@ -196,13 +195,9 @@ def test_an_iteration_without_a_pose_is_no_neighbour(root: Path, monkeypatch: py
         dataset[1]
 
 
-def test_logs_are_converted(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_logs_are_converted(root: Path, tmp_path: Path) -> None:
     convert = command(f"py123d:{root}", tmp_path / "new", "--images", "png", "--neighbours", "1", "--points", "source")
     assert main(convert) == 0
-    said = capsys.readouterr().err
-    assert said.startswith("note: kitti360: licence CC BY-NC-SA 3.0: read it before you share the conversion")
-    provenance = json.loads((tmp_path / "new" / "conversion" / "provenance.json").read_text())
-    assert provenance["source"]["licences"] == {"kitti360": "CC BY-NC-SA 3.0"}
     old, new = open_data(root, neighbours=Neighbours()), FrameFolder(tmp_path / "new", neighbours=Neighbours())
     assert new.tokens == old.tokens
     for before, after in ((old[k], new[k]) for k in range(3)):
@@ -213,14 +208,12 @@ def test_logs_are_converted(root: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert main(convert) == 0 and tree(tmp_path / "new") == files
 
 
-def test_licences_that_restrict_derivatives(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_logs(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_log(tmp_path / "source", dataset="physical-ai-av")
     write_log(tmp_path / "source", "merged", dataset="physical-ai-av")
     assert main(command(f"py123d:{tmp_path / 'source'}", tmp_path / "new")) == 0
     said = capsys.readouterr().err
-    assert "Agreement: it restricts who may be given derivatives, and the conversion is one" in said
-    assert said.index("restricts") < said.index("frame/s") and "no sequence.json" in said
-    assert not (tmp_path / "new" / "sequence.json").exists()
+    assert "no sequence.json" in said and not (tmp_path / "new" / "sequence.json").exists()
     data = open_data(tmp_path / "source", neighbours=Neighbours(count=9))
     assert "-merged-" in data.tokens[3] and torch.equal(data[3]["points"], data[0]["points"])
     assert all("-drive-" in frame["token"] for frame in data[2]["neighbours"])

@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import os
 import pickle
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
-from arbiview_aug.atomic_io import inside, remove_parts, write_whole
-from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import chosen_frames, gathered_warnings, told_once, writable_folder
+from arbiview_aug.atomic_io import remove_parts
+from arbiview_aug.cli.arguments import told_once, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State
-from arbiview_aug.cli.convert.writer import FOLDER, READING, RETARGET_OPTIONS, Settings, check_output
+from arbiview_aug.cli.convert.writer import Settings
 from arbiview_aug.cli.parallel import results, with_progress
-from arbiview_aug.datasets.depth_folder import FOLDERS, WithDepth
-from arbiview_aug.datasets.drive import Recording, is_converted
-from arbiview_aug.datasets.registry import kinds_of, open_data, split_kind
+from arbiview_aug.datasets.drive import is_converted
 from arbiview_aug.environment import one_thread, optional_package, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
-from arbiview_aug.evaluate.frames import Method, evaluate, make_frame
-from arbiview_aug.evaluate.metrics import RenderedView, as_arrays
-from arbiview_aug.evaluate.report.tables import evaluation_table, html_report
-from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.warm_up import compile_kernels
 
 
@@ -37,8 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     Returns 0; 1 if samples could not be read or rendered (unless skipped), or files could not be written.
     """
-    settings = _settings(arguments)
-    check_output(settings)
+    settings = Settings(arguments)
+    settings.check_output()
     data, (shard, shards) = settings.open(), (arguments.shard_index, arguments.num_shards)
     try:
         settings.retarget()
@@ -48,9 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise DataError(str(error)) from None
     jobs = Jobs(settings, data, range(shard, len(data), shards), skip=arguments.on_error == "skip")
     facts = {"versions": versions(), "settings": settings.rendering(), "source": jobs.format.facts()}
-    _print_notes(jobs.format.notes())
     if not is_converted(settings.output):
-        jobs.format.check()
+        _print_notes(jobs.format.check())
         writable_folder(settings.output, str(settings.output))
     jobs.manifest.begin(facts)
     remove_parts(settings.output, lambda owner: owner.isdecimal() and int(owner) % shards == shard)
@@ -85,61 +74,14 @@ def run(arguments: argparse.Namespace) -> int:
         raise DataError(f"{settings.output}: expected at least one sample that can be converted, got none")
     written, notes = jobs.format.finish(jobs.manifest.records(converted), {*left_out})  # tables and provenance
     _print_notes(notes)
-    jobs.manifest.write_provenance(facts, data.tokens, written)
+    jobs.manifest.finish(facts, data.tokens, written)
     print(f"look at it: python -m arbiview_aug check {settings.output}")
-    if arguments.report:
-        print(f"report: {write_report(settings, data, converted, arguments.report)}")
     return 0
 
 
 def _print_notes(notes: Iterable[str]) -> None:
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
-
-
-def _settings(arguments: argparse.Namespace) -> Settings:
-    kind, root = split_kind(arguments.data)
-    root = root.absolute()  # Ray's actors have another working directory
-    generator, depth = arguments.generator and Path(arguments.generator), _depth_folder(arguments, root)
-    target, names = load_rig(arguments.target), dict(arguments.names)
-    if unknown := names.keys() - {*target.names}:
-        got = ", ".join(sorted(unknown))
-        raise DataError(f"--names: expected cameras of the target, {', '.join(target.names)}, got {got}")
-    options = "version", *RETARGET_OPTIONS, "holes", *READING, "neighbours", "points"
-    return Settings(
-        root=root,
-        kind=kind,
-        target=target.with_cameras([replace(camera, name=names.get(camera.name, camera.name)) for camera in target]),
-        output=Path(arguments.output).absolute(),
-        generator=generator.absolute() if generator and os.path.exists(generator) else generator,  # or a hub id
-        motion_depth=None if depth is None else depth.absolute(),
-        suffix=f".{arguments.images}",  # type: ignore[arg-type]
-        **{name: getattr(arguments, name) for name in options},
-    )
-
-
-def _depth_folder(arguments: argparse.Namespace, root: Path) -> Path | None:
-    """The folder of ``--depth`` or of the depth command; None if the geometry reads none or estimates depth."""
-    folder, geometry = arguments.motion_depth, GEOMETRIES[arguments.geometry]
-    if folder is not None:
-        if not os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
-            raise DataError(f"--depth {folder}: expected a folder that the depth command wrote, found none")
-        kinds = {key for depths in WithDepth([], folder).folders if (key := depths.needed_by())} or {*FOLDERS}
-        fitting = [name for name, row in GEOMETRIES.items() if kinds & {*row.reads}]
-        if arguments.geometry not in fitting:
-            got = f"expected it with --geometry {', '.join(fitting)}, got {arguments.geometry}"
-            raise DataError(f"--depth {folder}: {got}")
-        return Path(folder)
-    if geometry.needs not in FOLDERS:
-        return None
-    defaults = [inside(root, name, "depth") for key, name in FOLDERS.items() if key in geometry.reads]
-    if there := [folder for folder in defaults if folder.is_dir()]:
-        return there[0] if len(there) == 1 else root  # with both kinds in it
-    if geometry.needs == "motion" and arguments.neighbours:
-        return None
-    model, motion = (" --model MODEL", "") if geometry.needs != "motion" else ("", ", or estimate it (--neighbours 2)")
-    fix = f"make it with python -m arbiview_aug depth --data DIR{model}, or name its folder (--depth){motion}"
-    raise DataError(f"--geometry {arguments.geometry}: expected depth in {defaults[0]}, found none; {fix}")
 
 
 def _run(jobs: Jobs, arguments: argparse.Namespace) -> Iterator[Done]:
@@ -178,32 +120,8 @@ def ray_results(jobs: Jobs, workers: int) -> Iterator[Done]:
     except (ValueError, ConnectionError) as error:
         raise DataError(f"--runner ray: expected a cluster (RAY_ADDRESS) that can be reached, got {error}") from None
     data.DataContext.get_current().enable_progress_bars = False
-    gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.holes == "diffusion" else 0.0
+    gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.options.holes == "diffusion" else 0.0
     rows = data.range(len(jobs), override_num_blocks=max(1, min(len(jobs), 4 * workers)))
     share = {"num_cpus": 1, "num_gpus": min(1.0, gpus / workers)}
     done = rows.map(Actor, fn_constructor_args=(jobs,), compute=data.ActorPoolStrategy(size=workers), **share)
     return (pickle.loads(row["done"]) for row in done.iter_rows())
-
-
-def write_report(settings: Settings, data: Recording, tokens: Sequence[str], count: int) -> Path:
-    """Score ``count`` converted frames, spread evenly over ``tokens``, as ``evaluate`` does; return the page's path."""
-    picked = [tokens[k] for k in chosen_frames(count, len(tokens))]
-    is_kept = settings.kind in kinds_of(settings.output)  # logs become frame folders; tables may have any name
-    kind = "nuscenes" if settings.version else settings.kind if is_kept else None
-    written = open_data(settings.output, kind=kind, version=settings.version, load_points=False)
-
-    def read_views(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
-        stored = written.by_token(sample["token"])
-        views = map(RenderedView, as_arrays(stored["images"]), map(np.asarray, stored["coverage"]))
-        by_name = dict(zip(stored["rig"].names, views, strict=True))  # in the reader's order
-        return [by_name[name] for name in rig.names]
-
-    # The views were rendered at the recorded exposures.
-    frames = ((token, make_frame(data.by_token(token), exposures=("raw",))) for token in picked)
-    with gathered_warnings([]):  # printed already during conversion
-        done = evaluate(frames, lambda _: settings.sized_target, [Method("converted", read_views)])
-    title = f"{data.root.resolve().name} as {settings.target.name or 'the target'} would have seen it"
-    notes = [f"{len(picked)} of {len(tokens)} frames. LiDAR points also score views that were made with them."]
-    page = html_report(title, done, ["converted"], [evaluation_table(done, ["converted"])], notes)
-    write_whole({(path := settings.output / FOLDER / "report.html"): page.encode()})
-    return path

@@ -5,28 +5,25 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import checksum, file_name, inside, link_whole, remove, write_new, write_whole
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import gathered_warnings
-from arbiview_aug.cli.convert.writer import FOLDER, Converted, Record, Settings, Writer
+from arbiview_aug.cli.convert.writer import Converted, Record, Settings, Writer
 from arbiview_aug.datasets.depth_folder import WithDepth
-from arbiview_aug.datasets.drive import BEGUN_FILE, FINISHED_FILE, Recording, WritableRecording
+from arbiview_aug.datasets.drive import BEGUN_FILE, CONVERSION_FOLDER, FINISHED_FILE, Recording
 from arbiview_aug.datasets.image_io import encoded, encoded_image
-from arbiview_aug.datasets.registry import find_reader
-from arbiview_aug.environment import repeatable_opencv
+from arbiview_aug.environment import imported, repeatable_opencv
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError, described, shown
 from arbiview_aug.files import read_text
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -67,120 +64,110 @@ class Jobs(Dataset[Done]):
     """Samples of a shard, by their ``indices``, each converted on access; DataError if the reader names no writer."""
 
     def __init__(self, settings: Settings, data: Recording, indices: Sequence[int], skip: bool) -> None:
-        _, reader = find_reader(settings.root, settings.kind, version=settings.version)
-        if reader.writer is None or not isinstance(data, WritableRecording):
-            raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
+        if data.writer is None:
+            raise DataError(f"--data {settings.root}: expected a kind that can be written, got {type(data).__name__}")
         self.settings, self.data, self.indices, self.skip = settings, data, indices, skip
-        depth = settings.motion_depth
-        self.samples = data if depth is None else WithDepth(data, depth)
-        module, _, name = reader.writer.partition(":")
-        self.format: Writer = getattr(import_module(module), name)(settings, data)
+        self.samples = data if settings.depth is None else WithDepth(data, settings.depth)
+        self.format: Writer = imported(data.writer)(settings, data)
         self.manifest = Manifest(settings.output)
 
     def __len__(self) -> int:
         return len(self.indices)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "retarget"}
-
     @cached_property
     def retarget(self) -> RigRetarget:
-        """The transform; one per process, with its plans and generator."""
+        """The transform with its plans and generator; made in each process, after the jobs were pickled."""
         return self.settings.retarget()
 
     def __getitem__(self, number: int) -> Done:
         index = self.indices[number]
         token = self.data.tokens[index]
         try:
-            return self._done(token, index)
+            return self._kept(token, index) or self._made(token, index)
         except OutputError as error:
             return Done(token, "stopped", messages=(str(error),))
         except Exception as error:  # any other error concerns this sample alone
             message = described(error)
         try:
+            record = self.manifest.record(token)
             if self.skip:
-                if "files" in (self.manifest.record(token) or {}):
+                if record is not None and "files" in record:
                     remove(self.manifest.folder / FINISHED_FILE)  # before a frame of it goes
-                self._remove_former(token)
-                self.manifest.write({"token": token, "skipped": message}, owner=str(index))
-            elif record := self.manifest.record(token):  # no shard may finish the output by an older record
+                self._replace_record({"token": token, "skipped": message}, index)
+            elif record is not None:  # no shard may finish the output by an older record
                 self.manifest.write({**record, "failed": message}, owner=str(index))
         except ArbiviewError as error:
             if self.skip or isinstance(error, OutputError):
                 return Done(token, "stopped", messages=(str(error),))
         return Done(token, "skipped" if self.skip else "failed", messages=(message,))
 
-    def _done(self, token: str, index: int) -> Done:
-        record = self.manifest.complete_record(token)
-        if record is not None and not record.get("without"):  # an unreadable neighbour may be readable by now
-            is_current = False
-            with suppress(Exception):  # reported when the sample is read
-                sources = self.source_files(index)
-                calibrations = [name for name, path in sources.items() if path.suffix == ".json"]
-                is_current = _sizes(sources) == record["source_bytes"] and all(
-                    checksum(sources[name]) == record["sources"][name] for name in calibrations
-                )
-            if is_current and "failed" in record:
-                self.manifest.write({key: record[key] for key in record if key != "failed"}, owner=str(index))
-            if is_current:
-                return Done(token, "kept", float(np.mean(record["coverage"])))
+    def _kept(self, token: str, index: int) -> Done | None:
+        """The result of an earlier run, if its files are in place and the sample's sources have not changed."""
+        record = self.manifest.record(token)
+        if record is None or "skipped" in record or "without" in record:  # that neighbour may be readable by now
+            return None
+        files = {self.settings.output / name: size for name, size in record["files"].items()}
+        if not all(file.is_file() and file.stat().st_size == size for file, size in files.items()):
+            return None
+        is_current = False
+        with suppress(Exception):  # reported when the sample is read
+            sources = self.source_files(index)
+            is_current = _sizes(sources) == record["source_bytes"] and all(
+                checksum(path) == record["sources"][name] for name, path in sources.items() if path.suffix == ".json"
+            )
+        if not is_current:
+            return None
+        if "failed" in record:
+            self.manifest.write({key: record[key] for key in record if key != "failed"}, owner=str(index))
+        return Done(token, "kept", float(np.mean(record["coverage"])))
+
+    def _made(self, token: str, index: int) -> Done:
+        """Read and retarget a sample, write its files, then its record."""
+        output, suffix, owner = self.settings.output, self.settings.suffix, str(index)
         warned: list[str] = []
         with gathered_warnings(warned), repeatable_opencv():
             sample = self.samples[index]
-            coverage = self._write(index, sample, self.retarget(sample))
-        return Done(token, "made", coverage, tuple(warned))
+            out = self.retarget(sample)
+            rig = rig_of(self.settings.sized_target, out, sample["rig"])
+            files: dict[str, bytes] = {}
+            names: list[dict[str, str]] = []
+            for k, camera in enumerate(rig):
+                view, stem = _view_files(out, k, suffix), self.format.stem(index, camera.name)
+                names.append({key: stem + (suffix if key == "file" else f".{key}.png") for key in view})
+                files |= zip(names[-1].values(), view.values(), strict=True)
+            rest, kept, facts = self.format.rest(Converted(index, sample, out, rig, names))
+            files |= rest
+            paths = {inside(output, name, f"--output {output}"): content for name, content in files.items()}
+            for name, source in kept.items():
+                link_whole(source, self.format.kept_path(name), owner)
+            write_whole(paths, owner)
+            sources = self.source_files(index)
+            sums = {path: checksum(path) for path in sources.values()}
+            cameras = zip(rig.to_dict()["cameras"], names, strict=True)
+            sizes = {name: len(content) for name, content in files.items()} | _sizes(kept)
+            digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+            record: dict[str, Any] = {
+                "token": token,
+                "ground_z_m": rig.ground_z_m,
+                "cameras": [{**camera, "file": view["file"]} for camera, view in cameras],
+                "coverage": [round(float(mask.float().mean()), 6) for mask in out["coverage"]],
+                "files": sizes,
+                "checksums": digests | {name: sums[source] for name, source in kept.items()},
+                "sources": {name: sums[path] for name, path in sources.items()},
+                "source_bytes": _sizes(sources),
+                **facts,
+            }
+            if without := [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]:
+                record["without"] = without
+            self._replace_record(record, index)
+        return Done(token, "made", float(np.mean(record["coverage"])), tuple(warned))
 
-    def _remove_former(self, token: str, now: Iterable[str] = ()) -> None:
-        """Remove files of the sample's last record, but for those that it has ``now``."""
-        record = self.manifest.record(token) or {}
-        for name in record.get("files", {}).keys() - now:
+    def _replace_record(self, record: Record, index: int) -> None:
+        """Remove files that the sample's former record names and this one does not, then write this one."""
+        former = self.manifest.record(record["token"]) or {}
+        for name in former.get("files", {}).keys() - record.get("files", {}).keys():
             remove(self.format.kept_path(name))
-
-    def _write(self, index: int, sample: Mapping[str, Any], out: Mapping[str, Any]) -> float:
-        """Write a sample's files, then its record; returns the mean of its cameras' shares of seen pixels."""
-        output, suffix = self.settings.output, self.settings.suffix
-        rig = rig_of(self.settings.sized_target, out, sample["rig"])
-        files: dict[str, bytes] = {}
-        names: list[dict[str, str]] = []
-        for k, camera in enumerate(rig):
-            stem = self.format.stem(index, camera.name)
-            view: dict[str, bytes] = {suffix: encoded_image(out["images"][k], suffix)}
-            for key in (key for key in MASKS if key in out):
-                mask = ~out[key][k] if key == "ego_mask" else out[key][k]
-                # convertScaleAbs rounds; both are faster than torch for a full-size mask.
-                is_flags = mask.dtype == torch.bool
-                grey = mask.numpy().view(np.uint8) * 255 if is_flags else cv2.convertScaleAbs(mask.numpy(), alpha=255)
-                view[f".{MASKS[key]}.png"] = encoded(grey, ".png")
-            names.append({ending: stem + ending for ending in view})
-            files |= {stem + ending: coded for ending, coded in view.items()}
-        rest, kept, facts = self.format.rest(Converted(index, sample, out, rig, names))
-        files |= rest
-        paths = {inside(output, name, f"--output {output}"): content for name, content in files.items()}
-        for name, source in kept.items():
-            link_whole(source, self.format.kept_path(name), owner=str(index))
-        write_whole(paths, owner=str(index))
-        images = [view[suffix] for view in names]
-        cameras = rig.to_dict()["cameras"]
-        coverage = [round(float(mask.float().mean()), 6) for mask in out["coverage"]]
-        sources = self.source_files(index)
-        sums = {path: checksum(path) for path in sources.values()}
-        record: dict[str, Any] = {
-            **{"token": self.data.tokens[index], "ground_z_m": rig.ground_z_m},
-            "cameras": [{**camera, "file": image} for camera, image in zip(cameras, images, strict=True)],
-            "coverage": coverage,
-            "files": {name: len(content) for name, content in files.items()}
-            | {name: source.stat().st_size for name, source in kept.items()},
-            "checksums": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-            | {name: sums[source] for name, source in kept.items()},
-            "sources": {name: sums[path] for name, path in sources.items()},
-            "source_bytes": _sizes(sources),
-            **facts,
-        }
-        if without := [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]:
-            record["without"] = without
-        self._remove_former(record["token"], record["files"])
         self.manifest.write(record, owner=str(index))
-        return float(np.mean(coverage))
 
     def source_files(self, index: int) -> dict[str, Path]:
         """Files that a sample is read from, by relative path from the root, which may lead out of it."""
@@ -192,6 +179,17 @@ class Jobs(Dataset[Done]):
             outside = Path(os.path.relpath(os.path.realpath(path), os.path.realpath(root)))
             sources[(path.relative_to(root) if path.is_relative_to(root) else outside).as_posix()] = path
         return sources
+
+
+def _view_files(out: Mapping[str, Any], k: int, suffix: str) -> dict[str, bytes]:
+    """Contents of a view's files, by their key in a calibration: the image ``file``, and the masks."""
+    files = {"file": encoded_image(out["images"][k], suffix)}
+    for key in (key for key in MASKS if key in out):
+        mask = (~out[key][k] if key == "ego_mask" else out[key][k]).numpy()
+        # convertScaleAbs rounds; both are faster than torch for a full-size mask.
+        grey = mask.view(np.uint8) * 255 if mask.dtype == bool else cv2.convertScaleAbs(mask, alpha=255)
+        files[MASKS[key]] = encoded(grey, ".png")
+    return files
 
 
 def _sizes(files: Mapping[str, Path]) -> dict[str, int]:
@@ -206,7 +204,7 @@ class Manifest:
     """
 
     def __init__(self, output: Path) -> None:
-        self.output, self.folder = output, output / FOLDER
+        self.output, self.folder = output, output / CONVERSION_FOLDER
 
     def begin(self, facts: Mapping[str, Any]) -> None:
         """Write versions, settings and source of the output; DataError if it was begun with others."""
@@ -237,17 +235,10 @@ class Manifest:
         """Yield the existing records in this order; 40,000 at once would take a gigabyte."""
         return filter(None, map(self.record, tokens))
 
-    def complete_record(self, token: str) -> Record | None:
-        """The record of a converted sample if all of its files are in place."""
-        record = self.record(token) or {"skipped": ""}
-        files = [(self.output / name, size) for name, size in record.get("files", {}).items()]
-        is_complete = all(file.is_file() and file.stat().st_size == size for file, size in files)
-        return record if is_complete and "skipped" not in record else None
-
     def write(self, record: Record, owner: str) -> None:
         write_whole({self.path(record["token"]): _signed(record)}, owner)
 
-    def write_provenance(self, facts: Mapping[str, Any], tokens: Sequence[str], finished: Sequence[str]) -> None:
+    def finish(self, facts: Mapping[str, Any], tokens: Sequence[str], finished: Sequence[str]) -> None:
         """Write versions, settings, and checksums of the source and of ``finished`` files to one file."""
         sources, skipped = {}, {}
         for record in self.records(tokens):

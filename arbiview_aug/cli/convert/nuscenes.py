@@ -20,60 +20,44 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-import torch
 
 from arbiview_aug.atomic_io import check_name, checksum, inside, link_whole, whole_file
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
-from arbiview_aug.cli.convert.writer import FOLDER, Converted, Record, Settings, Writer
+from arbiview_aug.cli.convert.writer import Converted, Record, Settings, Writer
+from arbiview_aug.datasets.drive import CONVERSION_FOLDER
 from arbiview_aug.datasets.nuscenes import tables as kinds
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING, NuScenesDataset
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR
-from arbiview_aug.datasets.nuscenes.tables import Kind, Row, Tables, Tokens, is_camera, on_circle
+from arbiview_aug.datasets.nuscenes.tables import Kind, Row, Tables, Tokens, is_camera
 from arbiview_aug.errors import CalibrationError, DataError
 from arbiview_aug.sample.boxes_2d import project_boxes_3d
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
-_TABLES = (
-    *("attribute", "category", "log", "map", "visibility", "sensor", "calibrated_sensor", "ego_pose", "scene"),
-    *("instance", "sample_annotation", "sample_data", "lidarseg", "panoptic", "sample"),
-)
-"""Tables in writing order; ``sample`` comes last, so that a root without it is not taken as complete."""
-
-_REFERENCES = (
-    ("sample", "scene_token", "scene"),
-    ("scene", "log_token", "log"),
-    ("instance", "category_token", "category"),
-    ("calibrated_sensor", "sensor_token", "sensor"),
-    ("sample_annotation", "sample_token", "sample"),
-    ("sample_annotation", "instance_token", "instance"),
-    ("sample_annotation", "visibility_token", "visibility"),
-    ("sample_data", "sample_token", "sample"),
-    ("sample_data", "ego_pose_token", "ego_pose"),
-    ("sample_data", "calibrated_sensor_token", "calibrated_sensor"),
-    ("scene", "first_sample_token", "sample"),
-    ("scene", "last_sample_token", "sample"),
-    ("instance", "first_annotation_token", "sample_annotation"),
-    ("instance", "last_annotation_token", "sample_annotation"),
-    *((table, key, table) for table in ("sample", "sample_annotation", "sample_data") for key in ("prev", "next")),
-)
-"""Table, column, and the table whose rows it names. An empty token means unknown; columns may be missing."""
-
-_NEEDED: Mapping[str, Mapping[str, Kind]] = {
-    "sample": {"timestamp": kinds.MICROSECONDS},
-    "sample_annotation": {"sample_token": kinds.TOKENS, "instance_token": kinds.TOKENS},
-    "sample_data": {
-        **dict.fromkeys(("sample_token", "ego_pose_token", "calibrated_sensor_token"), kinds.TOKENS),
-        **{"is_key_frame": kinds.FLAGS, "filename": kinds.FILES, "timestamp": kinds.MICROSECONDS},
-    },
-    "lidarseg": {"filename": kinds.FILES},
-    "panoptic": {"filename": kinds.FILES},
-}
-"""Columns without which rows cannot be kept."""
-
 _OF_POINTS = ("lidarseg", "panoptic")
 """Tables that label the source's points."""
+
+_COLUMNS: Mapping[str, Mapping[str, Kind | str]] = {
+    **{table: {} for table in ("attribute", "category", "log", "map", "visibility", "sensor")},
+    "calibrated_sensor": {"sensor_token": "sensor"},
+    "ego_pose": {},
+    "scene": {"log_token": "log"},
+    "instance": {"category_token": "category"},
+    "sample_annotation": {"sample_token": "sample", "instance_token": "instance", "visibility_token": "visibility"},
+    "sample_data": {
+        "sample_token": "sample",
+        "ego_pose_token": "ego_pose",
+        "calibrated_sensor_token": "calibrated_sensor",
+        **{"is_key_frame": kinds.FLAGS, "filename": kinds.FILES, "timestamp": kinds.MICROSECONDS},
+    },
+    **{table: {"filename": kinds.FILES} for table in _OF_POINTS},
+    "sample": {"timestamp": kinds.MICROSECONDS, "scene_token": "scene"},
+}
+"""Tables in writing order, with the columns that they are kept by: their kind, or the table whose rows they name.
+``sample`` comes last, so that a root without it is not taken as complete."""
+
+_MAY_LACK = ("log_token", "visibility_token")  # an empty token or none means unknown
 
 
 class NuScenes(Writer):
@@ -82,15 +66,14 @@ class NuScenes(Writer):
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
         super().__init__(settings, data)
         self.suffix, self.target = settings.suffix, settings.target
-        is_scanned = bool(self.target.lidars) and settings.points == "target"
+        is_scanned = bool(self.target.lidars) and settings.options.points == "target"
         self.scanned = is_scanned and data.lidar_channel is not None
         self.tables = Tables(data.root, data.version)
-        self.moment = data.lidar_channel or data.channels[0]
-        self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
-        labels = ("instance", "sample_annotation")  # whose rows name each other's
-        if len(lacking := [name for name in labels if name not in self.there]) == 1:
-            got = f"no {self.tables.path(*lacking)}"
-            raise DataError(f"nuScenes {data.root}: expected the tables {' and '.join(labels)} or neither, got {got}")
+        self.moment = data.lidar_channel or data.channels[0]  # sensor whose keyframes time the samples
+        sensors = {row["token"] for row in self.tables.rows("sensor") if not is_camera(row)}
+        calibrated = self.tables.rows("calibrated_sensor")
+        self.kept = {row["token"] for row in calibrated if row["sensor_token"] in sensors}  # calibrations
+        self.there = [name for name in _COLUMNS if self.tables.path(name).is_file()]
         self.written = [name for name in self.there if not (self.scanned and name in _OF_POINTS)]
         if lenses := [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]:
             fix = "convert to Rig.undistorted(), saved as a file, or frame folders, which carry lenses"
@@ -105,13 +88,8 @@ class NuScenes(Writer):
         root = self.data.root.resolve().name
         return {"kind": "nuscenes", "root": root, "version": self.data.version, "tables": tables}
 
-    def notes(self) -> list[str]:
-        names, wanted = self.target.names, CAMERA_RING
-        note = f"channels {', '.join(names)}: detectors' converters ask for {', '.join(wanted)} by name; --names "
-        return [] if {*wanted} <= {*names} else [f"{note}{names[0]}={wanted[0]} ... names them"]
-
-    def check(self) -> None:
-        """Read all tables once: no dangling references, duplicate tokens, circles, clashing or impossible names."""
+    def check(self) -> list[str]:
+        """Read all tables once: no dangling references, duplicate tokens, clashing or impossible names."""
         names = [PurePosixPath(self.data.moment_file(index)).name for index in range(len(self.data))]
         (stem, times), *_ = Counter(view_stem(name, "") for name in names).most_common(1)
         if times > 1:
@@ -124,43 +102,49 @@ class NuScenes(Writer):
             longest = view_stem(max(names, key=len), camera.name) + ".confidence.png"
             check_name(longest, f"rig {self.target.name!r}: camera {camera.name!r}")
         tables, there = self.tables, self.there
-        references = [(table, key, of) for table, key, of in _REFERENCES if table in there and of in there]
-        known_tokens = {of: Tokens(tables, of) for _, _, of in references}
-        named = {(table, key): Tokens(tables, table, key) for table, key, _ in references}
-        folders = {path.parent.relative_to(self.data.root).as_posix(): "maps" for path in self._maps()}
-        _, kept = kept_sensors(tables)
+        labels = {"instance", "sample_annotation"}  # whose rows name each other's
+        if len(lacking := labels - {*there}) == 1:
+            expected = f"expected the tables {' and '.join(sorted(labels))} or neither"
+            raise DataError(f"nuScenes {self.data.root}: {expected}, got no {tables.path(*lacking)}")
+        columns = [(table, key, kind) for table in there for key, kind in _COLUMNS[table].items()]
+        links = [(Tokens(tables, table, key), of) for table, key, of in columns if isinstance(of, str) and of in there]
+        tokens = {of: Tokens(tables, of) for _, of in links}
+        folders = set[str]()
+        for name in self._maps():
+            self._check_kept(name, "maps", folders)
         for table in there:
-            needed = _NEEDED.get(table, {})
-            columns = [column for (of, _), column in named.items() if of == table]
             for rows in tables.batches(table):
-                for key, kind in needed.items():
-                    tables.column(table, rows, key, kind)
-                if table == "instance":
-                    tables.column(table, rows, "nbr_annotations", kinds.COUNTS, default=0)
-                if table in known_tokens:
-                    known_tokens[table].add(rows)
-                for column in columns:
-                    column.add(rows, kinds.LINKS, default="")
-                for row in rows if table == "map" or "filename" in needed else ():
+                for key, kind in _COLUMNS[table].items():
+                    if isinstance(kind, Kind):
+                        tables.column(table, rows, key, kind)
+                if table in tokens:
+                    tokens[table].add(rows)
+                for link in (link for link, _ in links if link.table == table):
+                    link.add(rows, or_empty=link.key in _MAY_LACK)
+                for row in rows if table == "map" or "filename" in _COLUMNS[table] else ():
                     name = row.get("filename") or ""
-                    if (name or table != "map") and (table != "sample_data" or row["calibrated_sensor_token"] in kept):
-                        where = self._where(table, row)
-                        check_name(name, where)
-                        folders.setdefault(name.rpartition("/")[0], where)
-        for tokens in known_tokens.values():
-            tokens.check()
-        for table, key, of in references:
-            after = named[table, key].places_in(known_tokens[of], or_empty=key not in _NEEDED.get(table, {}))
-            for k in on_circle(after)[:1] if key in ("prev", "next") else ():
-                got = f"a circle through row {tables.row(table, int(k))['token']!r}"
-                raise tables.error(table, f"{key} that lead to an end", got, f"empty one row's {key}")
-        new_folders = (FOLDER, self.data.version, *(view_stem("", c.name).rpartition("/")[0] for c in self.target))
-        for folder, where in folders.items():
-            for root, what in ((self.data.root, where), (self.output, f"--output {self.output}: {where}")):
-                inside(root, folder or ".", what)
-            parts = PurePosixPath(folder).parts
-            if parts and (parts[0] in new_folders or "/".join(parts[:2]) in new_folders):
-                raise DataError(f"{where}: expected a file outside of {', '.join(new_folders)}, got one in {folder}")
+                    stays = table != "sample_data" or row["calibrated_sensor_token"] in self.kept
+                    if stays and (name or table != "map"):
+                        self._check_kept(name, self._where(table, row), folders)
+        for column in tokens.values():
+            column.check()
+        for link, of in links:
+            link.check_in(tokens[of])
+        names, wanted = self.target.names, CAMERA_RING
+        note = f"channels {', '.join(names)}: detectors' converters ask for {', '.join(wanted)} by name; --names "
+        return [] if {*wanted} <= {*names} else [f"{note}{names[0]}={wanted[0]} ... names them"]
+
+    def _check_kept(self, name: str, where: str, folders: set[str]) -> None:
+        """Refuse a kept file's name, and a folder that the conversion writes to; each of the ``folders`` once."""
+        check_name(name, where)
+        folder = name.rpartition("/")[0]
+        if folder in folders:
+            return
+        folders.add(folder)
+        self._kept(name, where)
+        new = (CONVERSION_FOLDER, self.data.version, *(view_stem("", c.name).rpartition("/")[0] for c in self.target))
+        if any(f"{folder}/".startswith(f"{other}/") for other in new):
+            raise DataError(f"{where}: expected a file outside of {', '.join(new)}, got one in {folder}")
 
     def stem(self, index: int, name: str) -> str:
         return view_stem(PurePosixPath(self.data.moment_file(index)).name, name)
@@ -177,24 +161,23 @@ class NuScenes(Writer):
             name = self.data.moment_file(converted.index)
             if not name.endswith(".bin"):  # others have a header
                 name = facts["lidar_file"] = f"{name}.bin"
-            lidar2ego = converted.rig.lidars[0].lidar2ego
-            if not len(out["points"]):
+            lidar2ego, points = converted.rig.lidars[0].lidar2ego, out["points"].numpy()
+            if not len(points):
                 fix = "--points source keeps those that were measured"
                 raise DataError(f"{name}: expected returns of the target's scanners, got none; {fix}")
-            points = out["points"].numpy()
             xyz = (points[:, :3] - lidar2ego[:3, 3]) @ lidar2ego[:3, :3]
             intensity = points[:, 3] if points.shape[1] > 3 else np.zeros(len(points))
             files[name] = np.column_stack([xyz, intensity, out[RINGS_KEY].numpy()]).astype("<f4").tobytes()
-            facts |= {"lidar2ego": lidar2ego.tolist()}
-            facts["num_lidar_pts"] = dict(zip(tokens, out.get(COUNTS_KEY, torch.empty(0)).tolist(), strict=True))
+            counts = out[COUNTS_KEY].tolist() if tokens else []
+            facts |= {"lidar2ego": lidar2ego.tolist(), "num_lidar_pts": dict(zip(tokens, counts, strict=True))}
         return files, {}, facts
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
         """Write the tables and link the files of the remaining sensors."""
-        tables = ConvertedTables(self.tables, records, left_out, self.scanned, self.moment, self.suffix)
+        tables = ConvertedTables(self, records, left_out)
         missing = 0
-        for path in self._maps():
-            link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"))
+        for name in self._maps():
+            link_whole(*self._kept(name, "maps"))
         for name in self.written:
             rows: Iterable[Row] = getattr(tables, name, partial(self.tables.rows, name))()
             with whole_file(self.kept_path(f"{self.data.version}/{name}.json")) as file:
@@ -213,8 +196,7 @@ class NuScenes(Writer):
             notes.append(f"{missing} files that sample_data names are not in the source: were sweeps not copied?")
         if unfit := sorted({*self.there} - {*self.written}):
             notes.append(f"left out, since they label the points that were measured: tables {', '.join(unfit)}")
-        unknown = sorted({path.stem for path in (self.data.root / self.data.version).glob("*.json")} - {*_TABLES})
-        if unknown:
+        if unknown := sorted({path.stem for path in self.tables.path("").parent.glob("*.json")} - {*_COLUMNS}):
             notes.append(f"left out, since they may describe the source's images: tables {', '.join(unknown)}")
         return [f"{self.data.version}/{name}.json" for name in self.written], notes
 
@@ -222,8 +204,9 @@ class NuScenes(Writer):
         """Paths of a kept file in the source and in the output; links must not leave either."""
         return inside(self.data.root, name, where), self.kept_path(name, where)
 
-    def _maps(self) -> list[Path]:
-        return sorted(path for path in (self.data.root / "maps").rglob("*") if not path.is_dir())
+    def _maps(self) -> list[str]:
+        paths = sorted(path for path in (self.data.root / "maps").rglob("*") if not path.is_dir())
+        return [path.relative_to(self.data.root).as_posix() for path in paths]
 
     def _where(self, table: str, row: Row) -> str:
         return f"nuScenes {self.data.root} {self.data.version}: table {table}: row {row.get('token')!r}: filename"
@@ -250,59 +233,52 @@ def level(share: float, source: str) -> str:
     return min(source, LEVELS[int(np.searchsorted(_BOUNDS, share, side="right"))]) if source in LEVELS else ""
 
 
-def kept_sensors(tables: Tables) -> tuple[set[str], set[str]]:
-    """Tokens of the sensors other than cameras, and of their calibrations."""
-    sensors = {row["token"] for row in tables.rows("sensor") if not is_camera(row)}
-    calibrated = tables.rows("calibrated_sensor")
-    return sensors, {row["token"] for row in calibrated if row["sensor_token"] in sensors}
-
-
 class ConvertedTables:
     """Rows of a converted root: a method for each table that changes, named after it.
 
-    The source's rows stay, except those of its cameras and of the samples ``left_out``; chains between rows are closed
-    again. A LiDAR keyframe of a sample that was left out becomes a sweep of the next sample of its scene. With
-    ``scanned``, scans of the sensor ``moment``, whose keyframes time the samples, are replaced like images. Rows of the
-    target's cameras and scanners come from the ``records`` of the converted samples; ``suffix`` is that of images.
+    The source's rows stay, except those of its cameras and of the samples ``left_out``: chains between the others
+    follow the time. A LiDAR keyframe of a sample that was left out becomes a sweep of the next sample of its scene.
+    Where scans are the target's, those of the sensor that times the samples are replaced like images. Rows of the
+    target's cameras and scanners come from the ``records`` of the converted samples.
 
     Attributes:
         calibrations: New rows of ``calibrated_sensor`` by token.
     """
 
-    def __init__(
-        self, tables: Tables, records: Iterable[Record], left_out: set[str], scanned: bool, moment: str, suffix: str
-    ) -> None:
-        self.tables, self.left_out, self.suffix = tables, left_out, suffix
-        self._drives: dict[str, list[str]] = {}  # tokens of samples by scene, in order of time
-        self._stand_in: dict[str, str] = {}
-        rows_of_scenes: dict[str, list[Row]] = {}
+    def __init__(self, writer: NuScenes, records: Iterable[Record], left_out: set[str]) -> None:
+        self.left_out, self.suffix = left_out, writer.suffix
+        tables = self.tables = writer.tables
+        scenes: dict[str, list[Row]] = {}
         for row in tables.rows("sample"):
-            rows_of_scenes.setdefault(row["scene_token"], []).append(row)
-        for scene, rows in rows_of_scenes.items():
+            scenes.setdefault(row["scene_token"], []).append(row)
+        self._drives: dict[str, list[str]] = {}  # tokens of the remaining samples by scene, in order of time
+        self._stand_in: dict[str, str] = {}  # each sample, or the next remaining one of its scene
+        places: dict[str, int] = {}  # of each sample in time
+        for scene, rows in scenes.items():
             tokens = [row["token"] for row in sorted(rows, key=lambda row: int(row["timestamp"]))]
+            places |= {token: k for k, token in enumerate(tokens)}
             drive = self._drives[scene] = [token for token in tokens if token not in left_out]
             later = drive[-1] if drive else ""
             for token in reversed(tokens):
                 later = self._stand_in[token] = later if token in left_out else token
-        self._sensors, kept = kept_sensors(tables)
-        lidar = next(row["token"] for row in tables.rows("sensor") if row["channel"] == moment)
+        lidar = next(row["token"] for row in tables.rows("sensor") if row["channel"] == writer.moment)
         timing = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] == lidar}
-        self._kept = kept - timing if scanned else kept
+        self._kept = writer.kept - timing if writer.scanned else writer.kept
         self._keyframes: dict[str, Row] = {}  # row that times each sample
         self._poses = set[str]()  # tokens of the ego poses in use
         for row in self._rows("sample_data"):
             sample, sensor = row["sample_token"], row["calibrated_sensor_token"]
-            if row["is_key_frame"] and sensor in timing and sample not in left_out:
+            is_moment = row["is_key_frame"] and sensor in timing and sample not in left_out
+            if is_moment:
                 self._keyframes[sample] = row
+            if is_moment or (sensor in self._kept and self._stand_in[sample]):
                 self._poses.add(row["ego_pose_token"])
-            elif sensor in self._kept and self._stand_in[sample]:
-                self._poses.add(row["ego_pose_token"])
-        annotations = self._rows("sample_annotation") if left_out else ()
-        self._annotations_left_out = {  # predecessor, successor and instance by token
-            row["token"]: (row.get("prev", ""), row.get("next", ""), row["instance_token"])
-            for row in annotations
-            if row["sample_token"] in left_out
-        }
+        tracks: dict[str, list[tuple[int, str]]] = {}
+        for row in self._rows("sample_annotation") if left_out and "sample_annotation" in writer.there else ():
+            if row["sample_token"] not in left_out:
+                tracks.setdefault(row["instance_token"], []).append((places[row["sample_token"]], row["token"]))
+        # Tokens of the remaining annotations by instance, in order of time; empty if all samples remain.
+        self._tracks = {instance: [token for _, token in sorted(track)] for instance, track in tracks.items()}
         self.calibrations: dict[str, Row] = {}
         self._visible: dict[str, float] = {}  # visible share of each annotation's box
         self._num_lidar_pts: dict[str, int] = {}  # points in it, where scans are the target's
@@ -323,7 +299,7 @@ class ConvertedTables:
                 self._scans[record["token"]] = {"calibrated_sensor_token": calibrated, **file}
 
     def sensor(self) -> Iterator[Row]:
-        yield from (row for row in self.tables.rows("sensor") if row["token"] in self._sensors)
+        yield from (row for row in self.tables.rows("sensor") if not is_camera(row))
         for name in dict.fromkeys(chain.from_iterable(self._views.values())):
             yield {"token": token_of("sensor", name), "channel": name, "modality": "camera"}
 
@@ -335,34 +311,22 @@ class ConvertedTables:
         return (row for row in self._rows("ego_pose") if row["token"] in self._poses)
 
     def scene(self) -> Iterator[Row]:
-        for row in self.tables.rows("scene"):
-            drive = self._drives.get(row["token"], [])
-            if drive or not self.left_out:
-                ends = {"first_sample_token": drive[0], "last_sample_token": drive[-1]} if drive else {}
-                yield self._changed(row, {"nbr_samples": len(drive), **ends})
+        return self._with_ends("scene", "sample", self._drives)
 
     def instance(self) -> Iterator[Row]:
-        fewer = Counter(instance for _, _, instance in self._annotations_left_out.values())
-        for row in self.tables.rows("instance"):
-            first, last = (row.get(f"{end}_annotation_token", "") for end in ("first", "last"))
-            remaining_first = self._remaining(first, 1)
-            if remaining_first or not first:
-                values = {"first_annotation_token": remaining_first, "last_annotation_token": self._remaining(last, 0)}
-                count = (row.get("nbr_annotations") or 0) - fewer[row["token"]]
-                yield self._changed(row, {**values, "nbr_annotations": count})
+        return self._with_ends("instance", "annotation", self._tracks)
 
     def sample_annotation(self) -> Iterator[Row]:
+        around = _around(self._tracks)
         for row in self._rows("sample_annotation"):
-            if row["token"] in self._annotations_left_out:
-                continue
-            around = {key: self._remaining(row.get(key, ""), k) for k, key in enumerate(("prev", "next"))}
-            row = self._changed(row, around)
-            if "visibility_token" in row:
-                share = self._visible.get(row["token"], 1.0)  # of a box that was not read, unknown
-                row = {**row, "visibility_token": level(share, row["visibility_token"])}
-            if row["token"] in self._num_lidar_pts:
-                row = {**row, "num_lidar_pts": self._num_lidar_pts[row["token"]]}
-            yield row
+            token = row["token"]
+            if row["sample_token"] not in self.left_out:
+                row = self._changed(row, **around.get(token, {}))
+                if "visibility_token" in row:
+                    share = self._visible.get(token, 1.0)  # of a box that was not read, unknown
+                    row = {**row, "visibility_token": level(share, row["visibility_token"])}
+                counts = {"num_lidar_pts": self._num_lidar_pts[token]} if token in self._num_lidar_pts else {}
+                yield {**row, **counts}
 
     def sample_data(self) -> Iterator[Row]:
         """The remaining rows; then new ones, at the time and ego pose of the samples' keyframes."""
@@ -372,49 +336,63 @@ class ConvertedTables:
                 yield row
             elif stand_in:
                 yield {**row, "sample_token": stand_in, "is_key_frame": False}
-        for drive in self._drives.values():
-            for before, sample, after in zip(["", *drive], drive, [*drive[1:], ""], strict=False):
-                moment, around = self._keyframes[sample], {"prev": before, "next": after}
-                if sample in self._scans:
-                    ends = {key: token and self._keyframes[token]["token"] for key, token in around.items()}
-                    yield {**moment, **self._scans[sample], **ends}
-                for name, view in self._views[sample].items():
-                    yield {
-                        **{"token": token_of(sample, name), "sample_token": sample},
-                        **{key: moment[key] for key in ("ego_pose_token", "timestamp")},
-                        **{"fileformat": self.suffix.removeprefix("."), "is_key_frame": True, **view},
-                        **{key: token and token_of(token, name) for key, token in around.items()},
-                    }
+        for sample, around in _around(self._drives).items():
+            moment = self._keyframes[sample]
+            if sample in self._scans:
+                ends = {key: token and self._keyframes[token]["token"] for key, token in around.items()}
+                yield {**moment, **self._scans[sample], **ends}
+            for name, view in self._views[sample].items():
+                yield {
+                    "token": token_of(sample, name),
+                    "sample_token": sample,
+                    "ego_pose_token": moment["ego_pose_token"],
+                    "timestamp": moment["timestamp"],
+                    "fileformat": self.suffix.removeprefix("."),
+                    "is_key_frame": True,
+                    **view,
+                    **{key: token and token_of(token, name) for key, token in around.items()},
+                }
 
     def sample(self) -> Iterator[Row]:
-        place = {token: (drive, k) for drive in self._drives.values() for k, token in enumerate(drive)}
-        for row in self.tables.rows("sample"):
-            if row["token"] in place:
-                drive, k = place[row["token"]]
-                around = {"prev": drive[k - 1] if k else "", "next": drive[k + 1] if k + 1 < len(drive) else ""}
-                yield self._changed(row, around)
+        around = _around(self._drives)
+        rows = (row for row in self.tables.rows("sample") if row["token"] in around)
+        return (self._changed(row, **around[row["token"]]) for row in rows)
+
+    def _with_ends(self, table: str, of: str, chains: Mapping[str, Sequence[str]]) -> Iterator[Row]:
+        """Rows of a table with the first, the last and the number of the rows in their chains."""
+        for row in self.tables.rows(table):
+            tokens = chains.get(row["token"], [])
+            ends = {f"first_{of}_token": tokens[0], f"last_{of}_token": tokens[-1]} if tokens else {}
+            if tokens or not self.left_out:
+                yield self._changed(row, **{f"nbr_{of}s": len(tokens)}, **ends)
 
     def _rows(self, table: str) -> Iterator[Row]:
         return chain.from_iterable(self.tables.batches(table))
 
-    def _changed(self, row: Row, values: Mapping[str, Any]) -> Row:
+    def _changed(self, row: Row, **values: Any) -> Row:
         """Set existing columns of a row; rows stay unchanged if nothing is left out."""
         return {**row, **{key: value for key, value in values.items() if key in row}} if self.left_out else row
-
-    def _remaining(self, token: str, direction: int) -> str:
-        """Follow a chain (0 back, 1 forward) to its first annotation that is not left out."""
-        while token in self._annotations_left_out:
-            token = self._annotations_left_out[token][direction]
-        return token
 
     def _calibrated(self, name: str, sensor: str, sensor2ego: list[list[float]], K: list[list[float]]) -> str:
         """Token of a calibration, which is collected."""
         token, pose = token_of("calibrated_sensor", name, json.dumps([K, sensor2ego])), np.array(sensor2ego)
         self.calibrations[token] = {
-            **{"token": token, "sensor_token": sensor, "translation": pose[:3, 3].tolist()},
-            **{"rotation": quaternion_from_rotation(pose[:3, :3]).tolist(), "camera_intrinsic": K},
+            "token": token,
+            "sensor_token": sensor,
+            "translation": pose[:3, 3].tolist(),
+            "rotation": quaternion_from_rotation(pose[:3, :3]).tolist(),
+            "camera_intrinsic": K,
         }
         return token
+
+
+def _around(chains: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]:
+    """Tokens before and after each token in its chain, as ``prev`` and ``next``, or empty."""
+    return {
+        token: {"prev": before, "next": after}
+        for tokens in chains.values()
+        for before, token, after in zip(["", *tokens], tokens, [*tokens[1:], ""], strict=False)
+    }
 
 
 def view_stem(lidar: str, name: str) -> str:

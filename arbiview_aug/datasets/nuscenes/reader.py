@@ -21,7 +21,7 @@ from arbiview_aug.datasets.drive import (
     Drive,
     LazyFrame,
     Neighbours,
-    WritableRecording,
+    Recording,
     camera_fields,
     checked_index,
     is_converted,
@@ -39,7 +39,7 @@ _COLUMNS = "say them: lidar_columns=['x', 'y', 'z', 'intensity'] (--lidar-column
 _LABELS = ("category", "sample_annotation")  # tables without which there are no boxes
 
 
-class NuScenesDataset(WritableRecording):
+class NuScenesDataset(Recording):
     """The keyframes of a nuScenes v1.0 data set, in the order of its ``sample`` table.
 
     A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;
@@ -84,6 +84,8 @@ class NuScenesDataset(WritableRecording):
         DataError: A missing or malformed table, a dangling token, unknown scenes or channels; on access, a missing or
             broken file.
     """
+
+    writer = "arbiview_aug.cli.convert.nuscenes:NuScenes"
 
     def __init__(
         self,
@@ -130,9 +132,7 @@ class NuScenesDataset(WritableRecording):
             warn(f"nuScenes {self.root}: sample_annotation {lacks}")
         self._sizes: dict[int, tuple[int, int]] = {}  # of sensors whose rows have none
         self._has_lidar_sweeps = False
-        self._drive_rows = np.empty(0, np.int64) if neighbours is None else self._find_drive_rows()
-        positions_m = self._recordings.ego2global(self._drive_rows)[:, :3, 3]
-        self._drive = Drive(positions_m, self._recordings.parts[self._drive_rows])
+        self._drive = None if neighbours is None else self._find_drive()
 
     def files(self, index: int) -> list[Path]:
         """Source files of a sample: each camera's image, masks of converted views, and last the LiDAR's points."""
@@ -162,9 +162,8 @@ class NuScenesDataset(WritableRecording):
             sample["boxes_3d"] = torch.from_numpy(self._annotations.at_sample(index, _inverse(ego2global)))
             sample["box_names"] = [self._annotations.categories[k] for k in self._annotations.category[boxes]]
             sample["box_tokens"] = [token.decode() for token in self._annotations.tokens[boxes].tolist()]
-        if self.neighbours is not None:
-            place = int(np.searchsorted(self._drive_rows, cameras[0]))
-            sample["neighbours"] = self._neighbours(self._drive, place)
+        if self._drive is not None:
+            sample["neighbours"] = self._neighbours(self._drive, cameras[0])
         return sample
 
     def _rig(self, cameras: IntArray, ego2global: FloatArray) -> Rig:
@@ -213,10 +212,10 @@ class NuScenesDataset(WritableRecording):
         points2ego = sensor2ego if own2ego is None else own2ego @ sensor2ego
         return partial(_read_points, self._file(lidar), points2ego, self.lidar_columns)
 
-    def _find_drive_rows(self) -> IntArray:
-        """Rows of the first camera that can be neighbours; finds out which sweeps were copied."""
+    def _find_drive(self) -> Drive:
+        """Recordings of the first camera that can be neighbours; finds out which sweeps were copied."""
         recordings = self._recordings
-        rows, is_key = np.arange(len(recordings.tokens)), recordings.rows["key"]
+        is_key, is_neighbour = recordings.rows["key"], recordings.rows["channel"] == 0
         sweeps = np.flatnonzero(~is_key)
         channels, first = np.unique(recordings.rows["channel"][sweeps], return_index=True)
         for channel, sweep in zip(channels, sweeps[first], strict=True):
@@ -228,22 +227,25 @@ class NuScenesDataset(WritableRecording):
                 f"nuScenes: {folder}: found no sweeps: only keyframes {'have points' if is_lidar else 'are neighbours'}"
             )
             if not is_lidar:
-                return rows[is_key[rows]]
-        return rows
+                is_neighbour &= is_key
+                break
+        rows = np.flatnonzero(is_neighbour)
+        return Drive(rows, recordings.ego2global(rows)[:, :3, 3], recordings.rows["scene"][rows])
 
-    def _token(self, place: int) -> str:
-        recordings, row = self._recordings, int(self._drive_rows[place])
+    def _token(self, row: int) -> str:
+        """A sample's token, or the name of a sweep's file."""
+        recordings = self._recordings
         is_key, sample = recordings.is_keyframe(row), recordings.rows["sample"][row]
-        return self.tokens[sample] if is_key else str(recordings.tokens[row].decode())
+        return self.tokens[sample] if is_key else recordings.file(row)
 
-    def _neighbour(self, place: int) -> LazyFrame:
-        recordings, row = self._recordings, int(self._drive_rows[place])
+    def _neighbour(self, row: int) -> LazyFrame:
+        recordings = self._recordings
         record, is_keyframe = recordings.rows[row], recordings.is_keyframe(row)
         sample = int(record["sample"])
         moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row
         ego2global, time_s = recordings.ego2global(moment), float(recordings.time_s(moment))
         cameras = recordings.around(row)
-        fields = {"token": self._token(place), "time_s": time_s, "ego2world": torch.from_numpy(ego2global)}
+        fields = {"token": self._token(row), "time_s": time_s, "ego2world": torch.from_numpy(ego2global)}
         fields["rig"] = self._rig(cameras, ego2global)
         fields |= self._masks(cameras, self._view_masks[:1])  # coverage
         global2ego, scene = _inverse(ego2global), int(record["scene"])

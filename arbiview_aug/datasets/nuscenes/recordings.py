@@ -18,7 +18,6 @@ from arbiview_aug.cameras.formats.entries import fitted
 from arbiview_aug.cameras.formats.fields import read_fields, unread_lens
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rotations import poses_from
-from arbiview_aug.datasets.drive import clock_message
 from arbiview_aug.datasets.nuscenes import tables as kinds
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables, Tokens
 from arbiview_aug.errors import CalibrationError, DataError, shown, warn
@@ -37,10 +36,9 @@ _OF_IMAGES = ("camera_intrinsic", "intrinsic", "intrinsics", "K", "translation",
 
 IntArray = npt.NDArray[np.int64]
 
-_NUMBERS = ("scene", "sample", "sensor", "pose", "file", "height", "width", "token")
+_NUMBERS = ("scene", "sample", "sensor", "pose", "file", "height", "width")
 _ROW = np.dtype([("channel", "i2"), ("time_us", "i8"), ("key", "?"), *((name, "i4") for name in _NUMBERS)])
-"""Columns of a recording: ``sensor`` is a row of sensor2ego and K, ``pose`` of poses, ``file`` of file_names; ``token``
-is the number of the first channel's rows in the table's order."""
+"""Columns of a recording: ``sensor`` is a row of sensor2ego and K, ``pose`` of poses, ``file`` of file_names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +54,6 @@ class Recordings:
     keyframes: IntArray  # (S, channels) row of each sample's recording; without a LiDAR the last is the first camera's
     poses: FloatArray  # (E, 7) ego poses: x y z and quaternion w x y z, world frame
     file_names: list[tuple[str, str | None]]  # file names before and after the time; None after a name without the time
-    tokens: npt.NDArray[np.bytes_]  # (F,) tokens of the first channel's rows; empty without sweeps
-    parts: IntArray  # (F,) numbers of the uninterrupted drives of these rows; empty without sweeps
 
     def file(self, row: int) -> str:
         """Name of a recording's file, relative to the root."""
@@ -116,7 +112,7 @@ def read_recordings(
     wanted = [*channels, lidar or ""]
     calibrated, channel_of, sensor2ego, K, lenses = _calibrations(tables, wanted)
     poses, files = dict[str, int](), dict[tuple[str, str | None], int]()
-    tokens, previous, parts, table = list[str](), list[str](), [np.empty(0, _ROW)], "sample_data"
+    parts, table = [np.empty(0, _ROW)], "sample_data"
     unique = Tokens(tables, table)
     for batch in tables.batches(table):
         is_key = tables.column(table, batch, "is_key_frame", kinds.FLAGS)
@@ -141,12 +137,7 @@ def read_recordings(
         names = tables.column(table, kept, "filename", kinds.FILES)
         names_cut = (name.partition(str(time_us)) for name, time_us in zip(names, times_us, strict=True))
         part["file"] = [files.setdefault((a, b if time else None), len(files)) for a, time, b in names_cut]
-        row_tokens = unique.add(kept)
-        if sweeps:
-            is_first = part["channel"] == 0
-            part["token"][is_first] = len(tokens) + np.arange(is_first.sum())
-            tokens += compress(row_tokens, is_first)
-            previous += tables.column(table, [*compress(kept, is_first)], "prev", kinds.LINKS)
+        unique.add(kept)
         parts.append(part)
     unique.check()
     rows = np.concatenate(parts)
@@ -173,8 +164,6 @@ def read_recordings(
         raise tables.error("sample_data", "timestamps in microseconds", got, fix)
     count = max(scenes, default=-1) + 1
     group = rows["channel"].astype(np.int64) * count + rows["scene"]
-    order = rows["token"][: len(tokens)]
-    tokens, previous = [tokens[k] for k in order], [previous[k] for k in order]
     return Recordings(
         channels=wanted,
         sensor2ego=sensor2ego,
@@ -185,8 +174,6 @@ def read_recordings(
         keyframes=keyframes,
         poses=_ego_poses(tables, poses),
         file_names=list(files),
-        tokens=np.array([token.encode() for token in tokens], np.bytes_),
-        parts=_parts(rows["scene"][: len(tokens)], tokens, previous, f"nuScenes {tables.root}"),
     )
 
 
@@ -239,17 +226,6 @@ def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:
         expected = f"the token {list(wanted)[k]!r} that a row of sample_data names"
         raise tables.error("ego_pose", expected, f"{counts[k]} of them" if counts[k] else "none")
     return poses
-
-
-def _parts(scene: npt.NDArray[Any], tokens: Sequence[str], previous: Sequence[str], where: str) -> IntArray:
-    """(F,) drive of each recording of a camera; it ends with its scene, without ``prev``, or if the clock goes back."""
-    number_of = {token: k for k, token in enumerate(tokens)}
-    before = np.array([number_of.get(token, -1) for token in previous], np.int64)
-    number = np.arange(len(before))
-    same_scene = (before >= 0) & (scene[before] == scene)
-    for k in np.flatnonzero(same_scene & (before > number)).tolist():
-        warn(clock_message(where, tokens[before[k]], tokens[k]))
-    return np.cumsum(~(same_scene & (before == number - 1)))
 
 
 # --- 3D boxes: as annotated at keyframes, interpolated between them ---------------------------------------------------

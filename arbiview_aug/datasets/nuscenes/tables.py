@@ -200,9 +200,9 @@ class Tokens:
         self.tables, self.table, self.key = tables, table, key
         self._hashes = [np.empty(0, np.int64)]
 
-    def add(self, rows: Sequence[Row], kind: Kind = TOKENS, default: str | None = None) -> list[str]:
+    def add(self, rows: Sequence[Row], or_empty: bool = False) -> list[str]:
         """Append the tokens of more rows and return them, checked as in ``Tables.column``."""
-        tokens = self.tables.column(self.table, rows, self.key, kind, default)
+        tokens = self.tables.column(self.table, rows, self.key, LINKS if or_empty else TOKENS, "" if or_empty else None)
         self._hashes.append(np.fromiter(map(hash, tokens), np.int64, len(tokens)))
         return tokens
 
@@ -214,29 +214,15 @@ class Tokens:
             token = self.tables.row(self.table, int(np.flatnonzero(self._all() == twice[0])[0]))[self.key]
             raise self.tables.error(self.table, "each token once", f"{token!r} twice", "remove one of the rows")
 
-    def places_in(self, other: Tokens, or_empty: bool) -> npt.NDArray[np.int64]:
-        """(rows,) row of another table that each token names, -1 for an empty one; DataError for a dangling token."""
-        wanted, there = self._all(), other._all()
-        if not len(there):
-            there = np.array([hash("")])
-        order = np.argsort(there)
-        at = order[np.minimum(np.searchsorted(there, wanted, sorter=order), len(there) - 1)]
-        at[there[at] != wanted] = -1
-        for k in np.flatnonzero((at < 0) & ~(or_empty & (wanted == hash(""))))[:1]:
+    def check_in(self, other: Tokens) -> None:
+        """Raise DataError for a token that no row of another table has; an empty one names none."""
+        known = np.append(other._all(), hash(""))
+        for k in np.flatnonzero(~np.isin(self._all(), known))[:1]:
             raise self.tables.dangling(self.table, self.tables.row(self.table, int(k)), self.key, other.table)
-        return at
 
     def _all(self) -> npt.NDArray[np.int64]:
         self._hashes = [np.concatenate(self._hashes)]
         return self._hashes[0]
-
-
-def on_circle(after: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Find a row on a circle for each endless chain; ``after`` (n,) has the next row of each row, or -1."""
-    ahead = np.append(after, -1)  # -1 leads to -1
-    for _ in range(len(after).bit_length()):  # by 1, 2, 4, ... rows, until past the longest chain
-        ahead = ahead[ahead]
-    return ahead[:-1][ahead[:-1] >= 0]
 
 
 class _NoListError(ValueError):

@@ -211,6 +211,15 @@ def test_a_sample_that_is_left_out_leaves_no_trace(
     assert list(provenance["skipped"]) == [LEFT_OUT]
 
 
+def test_a_sample_is_left_out_where_there_are_no_labels(source: Path, tmp_path: Path) -> None:
+    shutil.copytree(source, tmp_path / "source")
+    for table in ("instance", "sample_annotation"):
+        (tmp_path / "source" / "v1.0-mini" / f"{table}.json").unlink()
+    (tmp_path / "source" / NuScenesDataset(source).files(1)[2].relative_to(source)).write_bytes(b"\xff\xd8 cut off")
+    assert main(command(tmp_path / "source", tmp_path / "new", "--on-error", "skip")) == 0
+    assert LEFT_OUT not in NuScenesDataset(tmp_path / "new").tokens
+
+
 def test_lidar_files_that_are_missing(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A keyframe's is an error of its sample; sweeps that were not copied are a note."""
     shutil.copytree(source, tmp_path / "source")
