@@ -6,8 +6,9 @@ import io
 import sys
 from collections.abc import Sequence
 
+from arbiview_aug import __version__
 from arbiview_aug.cli.parsers import COMMANDS, check_together, parser_of
-from arbiview_aug.environment import imported, installed_version
+from arbiview_aug.environment import imported
 from arbiview_aug.errors import exit_status
 
 
@@ -27,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["--version"]:
-        print(f"arbiview_aug {installed_version('arbiview_aug') or '(not installed)'}")
+        print(f"arbiview_aug {__version__}")
         return 0
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())

@@ -95,21 +95,15 @@ def whole_file(path: Path, owner: str = "") -> Iterator[BinaryIO]:
     ``owner``, letters or digits, is part of the temporary file's name, for ``remove_parts``. The folder is created.
     OutputError if it cannot be written: a full disk, no permission. Other errors of the block pass.
     """
-    with writing(path, _OF_DISKS):
-        with writing(path):
-            part = _part(path, owner)
-            file = part.open("xb")
-        try:
-            with file:
-                yield file
-                with writing(path):
-                    file.flush()
-                    os.fsync(file.fileno())
-            with writing(path):
-                os.replace(part, path)
-        finally:
-            with suppress(OSError):
-                part.unlink()
+    with writing(path):
+        part = _part(path, owner)
+        file = part.open("xb")
+    try:
+        with writing(path, _OF_DISKS), file:
+            yield file
+        _put({path: part})
+    finally:
+        _discard(part)
 
 
 def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
@@ -119,23 +113,10 @@ def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
         for path, content in files.items():
             with writing(path):
                 parts[path] = _part(path, owner)
-                with parts[path].open("xb") as file:
-                    file.write(content)
-
-        def flush(part: Path) -> None:
-            with part.open("rb") as file:
-                os.fsync(file.fileno())
-
-        with ThreadPoolExecutor(_FLUSHES) as pool:
-            flushed = [(path, pool.submit(flush, part)) for path, part in parts.items()]
-        for path, is_flushed in flushed:
-            with writing(path):
-                is_flushed.result()
-                os.replace(parts[path], path)
+                parts[path].write_bytes(content)
+        _put(parts)
     finally:
-        for part in parts.values():
-            with suppress(OSError):
-                part.unlink()
+        _discard(*parts.values())
 
 
 def write_new(path: Path, content: bytes) -> None:
@@ -145,17 +126,44 @@ def write_new(path: Path, content: bytes) -> None:
     try:
         write_whole({part: content})
         with writing(path):
-            try:
-                os.link(part, path)
-            except FileExistsError:
-                pass
-            except OSError as error:
-                if error.errno not in _NO_LINKS:
-                    raise
+            if not _is_linked(part, path):
                 os.replace(part, path)
     finally:
+        _discard(part)
+
+
+def _put(parts: Mapping[Path, Path]) -> None:
+    """Flush temporary files to the disk, then rename them to the paths that they are for."""
+
+    def flush(part: Path) -> None:
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+
+    with ThreadPoolExecutor(_FLUSHES) as pool:
+        flushed = {path: pool.submit(flush, part) for path, part in parts.items()}
+    for path, part in parts.items():
+        with writing(path):
+            flushed[path].result()
+            os.replace(part, path)
+
+
+def _discard(*parts: Path) -> None:
+    for part in parts:
         with suppress(OSError):
             part.unlink()
+
+
+def _is_linked(source: Path, path: Path) -> bool:
+    """Link a file, unless another process was faster; False on a disk without hard links."""
+    try:
+        os.link(source, path)
+    except FileExistsError:
+        pass
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        return False
+    return True
 
 
 def link_whole(source: Path, path: Path, owner: str = "") -> None:
@@ -175,14 +183,8 @@ def link_whole(source: Path, path: Path, owner: str = "") -> None:
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
-        try:
-            os.link(source.resolve(), path)
+        if _is_linked(source.resolve(), path):
             return
-        except FileExistsError:  # another process was faster
-            return
-        except OSError as error:
-            if error.errno not in _NO_LINKS:
-                raise
     with whole_file(path, owner) as file, _reading(source):
         for block in _blocks(source):
             with writing(path):

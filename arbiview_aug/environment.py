@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import ast
-import gc
 import os
 import pkgutil
 import platform
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
 from importlib import import_module, metadata
-from io import BytesIO
 from numbers import Number
 from pathlib import Path
 from typing import Any
 
+import arbiview_aug
 from arbiview_aug.errors import MissingPackageError, warn
 
 _CV2_WHEELS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
@@ -95,7 +93,6 @@ def compiled(function: Any, **options: Any) -> Any:
     """
     from numba import njit
 
-    _compilation()
     options["no_cfunc_wrapper"] = True  # C calls none
     kernel: Any = njit(error_model="numpy", nogil=True, **options)(function)
     with suppress(RuntimeError):  # no locator available: neither the package's folder nor the user's can be written
@@ -129,23 +126,25 @@ def inlined(function: Any) -> Any:
 @contextmanager
 def compilation_announced() -> Iterator[None]:
     """Say on stderr that kernels are compiled, where numba's cache does not hold them."""
-    announcers = _compilation().announcers
-    announcers.append(None)  # threads announce at the same time
-    try:
+    from numba.core import event
+
+    with event.install_listener("numba:compile", _announcer()):
         yield
-    finally:
-        announcers.pop()
 
 
-def is_kept(kernel: Any) -> bool:
-    """Whether numba's cache holds a kernel in its present form; a kernel without a cache counts as held."""
-    files = getattr(kernel._cache, "_cache_file", None)
-    return files is None or bool(files._load_index())
+@cache
+def _announcer() -> Any:
+    from numba.core import event
 
+    class Announcer(event.Listener):  # type: ignore[misc]
+        def on_start(self, event: Any) -> None:
+            if event.data["dispatcher"].py_func.__module__.startswith("arbiview_aug."):
+                say_compiling()
 
-def working_s() -> float:
-    """Read a clock, in seconds, that stops while kernels are compiled."""
-    return time.perf_counter() - _compilation().seconds
+        def on_end(self, event: Any) -> None:
+            pass
+
+    return Announcer()
 
 
 @cache
@@ -154,35 +153,10 @@ def say_compiling() -> None:
     print("arbiview_aug: compiling kernels that were not used before", file=sys.stderr)
 
 
-@cache
-def _compilation() -> Any:
-    """The listener that measures how long this process compiled kernels."""
-    from numba.core import event
-
-    class Compilation(event.Listener):  # type: ignore[misc]
-        seconds, depth, start_s, collects = 0.0, 0, 0.0, False
-        announcers: list[None] = []  # noqa: RUF012  # there is one listener
-
-        def on_start(self, event: Any) -> None:
-            if not self.depth and not event.data["dispatcher"].py_func.__module__.startswith("arbiview_aug."):
-                return
-            if not self.depth:
-                if self.announcers:
-                    say_compiling()
-                self.start_s, self.collects = time.perf_counter(), gc.isenabled()
-                gc.disable()  # the compiler's many small objects would be searched for garbage over and over
-            self.depth += 1
-
-        def on_end(self, event: Any) -> None:
-            self.depth -= self.depth > 0
-            if not self.depth and self.start_s:
-                self.seconds, self.start_s = self.seconds + time.perf_counter() - self.start_s, 0.0
-                if self.collects:
-                    gc.enable()
-
-    listener = Compilation()
-    event.register("numba:compile", listener)
-    return listener
+def is_kept(kernel: Any) -> bool:
+    """Whether numba's cache holds a kernel in its present form; a kernel without a cache counts as held."""
+    files = getattr(kernel._cache, "_cache_file", None)
+    return files is None or bool(files._load_index())
 
 
 @cache
@@ -191,7 +165,7 @@ def _kernel_cache() -> type:
     from numba.core.caching import FunctionCache, IndexDataCacheFile
 
     class Files(IndexDataCacheFile):  # type: ignore[misc]
-        """Files of a kernel that end in their SHA-256; code is named after its signature, for concurrent processes."""
+        """Code that ends in its SHA-256, in files named after the signature, for concurrent processes."""
 
         def save(self, key: Any, data: Any) -> None:
             name = f"{self._index_name[:-4]}.{sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
@@ -200,22 +174,19 @@ def _kernel_cache() -> type:
 
         def _load_index(self) -> Any:
             try:
-                return super()._load_index() if is_intact(Path(self._index_path)) else {}
-            except (ImportError, AttributeError):  # of another version, whose arguments' classes are elsewhere now
+                return super()._load_index()
+            except Exception:  # a damaged file, or one of a version whose arguments' classes are elsewhere now
                 return {}
 
-        def _load_data(self, name: str) -> Any:
-            path = self._data_path(name)
-            if not is_intact(Path(path)):
-                raise FileNotFoundError(path)  # it is compiled again
-            return super()._load_data(name)
+        def _dump(self, data: Any) -> bytes:
+            content = super()._dump(data)
+            return bytes(content + sha256(content).digest())  # pickle reads no further than its end
 
-        @contextmanager
-        def _open_for_write(self, path: str) -> Iterator[BytesIO]:
-            content = BytesIO()
-            yield content
-            with super()._open_for_write(path) as file:
-                file.write(content.getvalue() + sha256(content.getvalue()).digest())
+        def _load_data(self, name: str) -> Any:
+            content = Path(self._data_path(name)).read_bytes()
+            if sha256(content[:-32]).digest() != content[-32:]:
+                raise FileNotFoundError(name)  # damaged: it is compiled again
+            return super()._load_data(name)
 
     class KernelCache(FunctionCache):  # type: ignore[misc]
         def __init__(self, function: Any) -> None:
@@ -237,20 +208,6 @@ def _kernel_cache() -> type:
                 super().save_overload(signature, data)
 
     return KernelCache
-
-
-def is_intact(path: Path) -> bool:
-    """Check a file that ends in its SHA-256; delete it if it is damaged."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return False
-    if sha256(content[:-32]).digest() == content[-32:]:
-        return True
-    with suppress(OSError):
-        path.unlink()
-    print(f"arbiview_aug: the damaged kernel {path} is deleted and compiled again", file=sys.stderr)
-    return False
 
 
 @contextmanager
@@ -290,6 +247,6 @@ def versions() -> dict[str, str]:
     """Versions that results and times depend on."""
     import cv2
 
-    names = "arbiview_aug", "torch", "numpy", "kornia"
-    packages = {name: installed_version(name) or "not installed" for name in names}
-    return {"python": platform.python_version(), "opencv": cv2.__version__, **packages}
+    packages = {name: installed_version(name) or "not installed" for name in ("torch", "numpy", "kornia")}
+    python, package = platform.python_version(), arbiview_aug.__version__  # that of an editable install may be old
+    return {"python": python, "opencv": cv2.__version__, "arbiview_aug": package, **packages}

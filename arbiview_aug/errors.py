@@ -7,7 +7,6 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from multiprocessing import parent_process
 from types import FrameType
 
 _SHORT = reprlib.Repr()
@@ -108,41 +107,25 @@ class GeometryWarning(UserWarning):
 
 
 class WarnOnce:
-    """Warnings issued once per topic; ``topics`` are those issued.
-
-    A warning points at the user's nearest line; in a DataLoader's worker without one, at the line that built this.
-    """
+    """Warnings issued once per topic; ``topics`` are those issued."""
 
     def __init__(self) -> None:
         self.topics: set[str] = set()
-        frame = _users_frame()
-        self._built_at = _UNKNOWN if frame is None else (frame.f_code.co_filename, frame.f_lineno)
 
     def __call__(self, topic: str, message: str, category: type[Warning] = UserWarning) -> None:
         """Warn, unless this topic was warned of before. Filters that make it an error do so for every sample."""
         if topic not in self.topics:
-            warn(message, category, otherwise=self._built_at)
+            warn(message, category)
             self.topics.add(topic)
 
 
-_UNKNOWN = ("sys", 1)  # as Python's own warnings without a frame
 _NOT_USERS = frozenset(("arbiview_aug", "torch", "torchvision")) | sys.stdlib_module_names
 
 
-def warn(message: str, category: type[Warning] = UserWarning, *, otherwise: tuple[str, int] = _UNKNOWN) -> None:
-    """Warn at the user's nearest line, or at the file and line ``otherwise`` if no frame is the user's."""
-    frame = _users_frame()
-    if frame is None:
-        warnings.warn_explicit(message, category, *otherwise)
-        return
-    module, registry = frame.f_globals.get("__name__"), frame.f_globals.setdefault("__warningregistry__", {})
-    warnings.warn_explicit(message, category, frame.f_code.co_filename, frame.f_lineno, module, registry)
-
-
-def _users_frame() -> FrameType | None:
-    """Nearest frame outside this package, torch and the standard library; None in a spawned process without one."""
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the nearest line outside this package, torch and the standard library."""
     frame: FrameType | None = sys._getframe(1)
+    level = 2
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _NOT_USERS:
-        frame = frame.f_back
-    is_start = frame is not None and frame.f_back is None and frame.f_code.co_filename == "<string>"
-    return None if is_start and parent_process() is not None else frame
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)

@@ -48,9 +48,6 @@ class LRUCache(Generic[K, V]):
         with self._lock:
             return sum(map(self._size, self._values.values()))
 
-    def __contains__(self, key: K) -> bool:
-        return key in self._values
-
     def __len__(self) -> int:
         return len(self._values)
 

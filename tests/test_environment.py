@@ -1,9 +1,8 @@
-"""Kernels: damaged caches, folders that cannot be written, and the time that compiling takes."""
+"""Kernels: damaged caches, and folders that cannot be written."""
 
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,8 +11,9 @@ import numpy as np
 import pytest
 from numba.core import caching, config
 
-from arbiview_aug import environment
-from arbiview_aug.environment import compilation_announced, compiled, working_s
+from arbiview_aug import __version__, environment
+from arbiview_aug.__main__ import main
+from arbiview_aug.environment import compilation_announced, compiled
 
 
 def _garbled(content: bytes) -> bytes:
@@ -46,19 +46,14 @@ def kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
 @pytest.mark.parametrize("how", DAMAGE)
-def test_damaged_kernels_are_compiled_anew(
-    kernel: Callable[[], Any], suffix: str, how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_kernels_are_compiled_anew(kernel: Callable[[], Any], suffix: str, how: str, tmp_path: Path) -> None:
     assert kernel()(3) == 6
     (path,) = tmp_path.rglob(f"*.{suffix}")
     path.write_bytes(DAMAGE[how](path.read_bytes()))
-    capsys.readouterr()
-    assert kernel()(4) == 8
-    words = f"arbiview_aug: the damaged kernel {path} is deleted and compiled again\n"
-    assert capsys.readouterr().err == words
+    again = kernel()
+    assert again(4) == 8 and not again.stats.cache_hits
     third = kernel()
     assert third(5) == 10 and sum(third.stats.cache_hits.values()) == 1
-    assert capsys.readouterr().err == ""
 
 
 class Pair(NamedTuple):
@@ -114,12 +109,10 @@ def test_kernels_are_compiled_anew_when_one_that_they_call_or_a_constant_changes
     assert fourth(3) == 6 and not fourth.stats.cache_hits
 
 
-def test_compiling_is_announced_and_not_timed(kernel: Callable[[], Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_compiling_is_announced(kernel: Callable[[], Any], capsys: pytest.CaptureFixture[str]) -> None:
     environment.say_compiling.cache_clear()  # other tests of this process may have compiled
-    start_s, working = time.perf_counter(), working_s()
     with compilation_announced():
         assert kernel()(3) == 6
-    assert time.perf_counter() - start_s > working_s() - working
     assert capsys.readouterr().err == "arbiview_aug: compiling kernels that were not used before\n"
     environment.say_compiling.cache_clear()
     with compilation_announced():
@@ -137,3 +130,10 @@ def test_processes_that_save_a_kernel_at_the_same_time_do_not_mix_its_versions(
     assert first(3) == 6 and second(3.5) == 7.0
     third = kernel()
     assert third(3) == 6 and third(3.5) == 7.0
+
+
+def test_the_version_is_that_of_the_code(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Metadata of an editable install keep the version that it was installed with."""
+    monkeypatch.setattr(environment.metadata, "version", lambda name: "0.0.1")
+    assert environment.versions()["arbiview_aug"] == __version__
+    assert main(["--version"]) == 0 and capsys.readouterr().out == f"arbiview_aug {__version__}\n"

@@ -17,7 +17,6 @@ from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.arguments import PICTURES, frames_text, gathered_warnings, writable_folder
 from arbiview_aug.cli.evaluate import measured, open_frames
 from arbiview_aug.cli.parsers import SIZE
-from arbiview_aug.environment import working_s
 from arbiview_aug.evaluate.frames import retargeting, views_of
 from arbiview_aug.evaluate.metrics import as_arrays
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
@@ -81,7 +80,7 @@ def timed(retarget: Callable[[Mapping[str, Any]], Any], sample: Mapping[str, Any
         moved_m = k * _SHIFT_M
         moved = {"rig": sample["rig"].shifted(x_m=moved_m), "boxes_3d": None if boxes is None else boxes + moved_m}
         call = partial(retarget, {**sample, **moved})
-        first, again = (1e3 * timeit(call, timer=working_s, number=1) for _ in range(2))
+        first, again = (1e3 * timeit(call, number=1) for _ in range(2))
         ms.append((again, first))
     again_ms, first_ms = (statistics.median(times) for times in zip(*ms[1:], strict=True))  # the first has other work
     return again_ms, first_ms

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
-from arbiview_aug.environment import one_thread, working_s
+from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import OutputError
 
 Result = TypeVar("Result")
@@ -48,8 +48,6 @@ def results(jobs: Dataset[Result], workers: int, label: str) -> Iterator[Result]
 def with_progress(done: Iterable[Result], count: int, label: str) -> Iterator[Result]:
     """Yield ``count`` results as they come, behind a progress bar with frames/s and the remaining time."""
     with tqdm(total=count, unit="frame", desc=label) as bar:
-        bar._time = working_s
-        bar.reset()
         for result in done:
             bar.update()
             yield result

@@ -27,21 +27,15 @@ def split(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
 
     SampleError, which begins with ``key``, for other leading dimensions.
     """
-    try:
-        return [entry(value, lead, index) for index in np.ndindex(*lead)]
-    except ValueError as error:
-        raise SampleError(f"{key}: {error}") from None
-
-
-def entry(value: Any, lead: tuple[int, ...], index: tuple[int, ...]) -> Any:
-    """One frame's entry, as ``split`` gives it, at an ``index`` into the leading dimensions."""
     if not lead:
-        return value
-    if isinstance(value, list | tuple):
-        return [entry(part, lead, index) for part in value]
-    if tuple(value.shape[: len(lead)]) != lead:
-        raise ValueError(f"expected the images' leading dimensions {lead}, got shape {tuple(value.shape)}")
-    return value[index]
+        return [value]
+    is_list = isinstance(value, list | tuple)
+    for part in value if is_list else [value]:
+        shape = getattr(part, "shape", None)
+        if shape is None or tuple(shape[: len(lead)]) != lead:
+            got = type(part).__name__ if shape is None else f"shape {tuple(shape)}"
+            raise SampleError(f"{key}: expected the images' leading dimensions {lead}, got {got}")
+    return [[part[index] for part in value] if is_list else value[index] for index in np.ndindex(*lead)]
 
 
 def is_readable(value: Any) -> bool:
@@ -64,15 +58,9 @@ def stacked(views: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
 
 def covered(winners: Sequence[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
     """Coverage of (h, w) int8 winning sources, stacked where all sizes agree."""
-    if winners[0].device.type != "cpu":
-        return stacked([winner >= 0 for winner in winners])
-    # On the CPU numpy compares faster than torch.
-    if len({winner.shape for winner in winners}) > 1:
-        return [torch.from_numpy(winner.numpy() >= 0) for winner in winners]
-    coverage = torch.empty((len(winners), *winners[0].shape), dtype=torch.bool)
-    for winner, mask in zip(winners, coverage.numpy(), strict=True):
-        np.greater_equal(winner.numpy(), 0, out=mask)
-    return coverage
+    if winners[0].device.type == "cpu":  # numpy compares faster there
+        return stacked([torch.from_numpy(winner.numpy() >= 0) for winner in winners])
+    return stacked([winner >= 0 for winner in winners])
 
 
 def gathered(parts: Sequence[Any], lead: tuple[int, ...]) -> Any:

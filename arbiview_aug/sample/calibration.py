@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import operator
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import zip_longest
 from typing import Any
@@ -13,30 +14,23 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint
-from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
+from arbiview_aug.cameras.lens import LENSES, FloatArray, canonical_name
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line, shown
-from arbiview_aug.sample.batching import entry
 from arbiview_aug.scene.surface import Points
 
-CHECKED_KEYS = frozenset(("K", "cam2ego", "lens", "distortion", "ground_z_m"))
-"""Keys that are compared with the transform's ``source``."""
+NUMBERS = ("K", "cam2ego", "distortion", "ground_z_m")
+"""Keys of a calibration's arrays."""
 
 _OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
 _ON_CENTER = 0.05  # with K of another image size it is farther off along both axes
 
 
-def read_rig(
-    images: tuple[torch.Tensor, ...],
-    sample: Mapping[str, Any],
-    source: Rig | None,
-    lead: tuple[int, ...] = (),
-    index: tuple[int, ...] = (),
-) -> Rig:
-    """Read the rig of one frame's images, at an ``index`` into the sample's leading dimensions."""
+def read_rig(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], source: Rig | None) -> Rig:
+    """Read the rig of one frame's images from its ``sample`` without leading dimensions."""
     rig = sample.get("rig")
     if rig is None:
-        rig = source if source is not None else _rig_from_tensors(images, sample, index)
+        rig = source if source is not None else _rig_from_tensors(images, sample)
     if not isinstance(rig, Rig):
         raise SampleTypeError(f"rig: expected an arbiview_aug.Rig, got {type(rig).__name__}; use load_rig(path)")
     if len(rig) != len(images):
@@ -47,44 +41,45 @@ def read_rig(
             fix = "height and width are swapped" if size == camera.size[::-1] else "use rig.resized((h, w)) or crop"
             expected = f"an image of (h, w) = {camera.size}, as calibrated"
             raise SampleError(f"camera {camera.name!r}: expected {expected}, got {size}; {fix}")
-    return _with_masks(rig, sample, lead, index)
+    return _with_masks(rig, sample)
 
 
-def differing_keys(source: Rig, sample: Mapping[str, Any], lead: tuple[int, ...]) -> Iterator[str]:
-    """Calibration keys of a sample that are not those of the transform's ``source``, beyond rounding."""
-    for key, expected in (("K", source.K), ("cam2ego", source.cam2ego), ("ground_z_m", np.array(source.ground_z_m))):
-        got = expected if sample.get(key) is None else numbers(key, sample[key])
-        is_shaped = expected.ndim == 0 or got.shape in (expected.shape, (*lead, *expected.shape))
-        if not is_shaped or not np.allclose(got, expected, 1e-4, 1e-3):
-            yield key
+def check_source(source: Rig, sample: Mapping[str, Any]) -> None:
+    """Refuse a frame whose calibration is not that of the transform's ``source``, beyond rounding."""
+    differing = []
+    for key in ("K", "cam2ego", "ground_z_m"):
+        given, expected = sample.get(key), np.asarray(getattr(source, key))
+        is_shaped = given is None or not expected.ndim or given.shape == expected.shape
+        if not is_shaped or (given is not None and not np.allclose(given, expected, 1e-4, 1e-3)):
+            differing.append(key)
     if sample.get("lens") is not None or sample.get("distortion") is not None:
-        for index in np.ndindex(*lead):
-            for camera, (lens, coefficients) in zip(source, _lenses(sample, len(source), index), strict=True):
-                pairs = zip_longest(camera.distortion, coefficients, fillvalue=0.0)
-                if lens != camera.lens or not all(math.isclose(*pair, rel_tol=1e-4, abs_tol=1e-6) for pair in pairs):
-                    yield "lens"
+        for camera, (lens, coefficients) in zip(source, _lenses(sample, len(source)), strict=True):
+            pairs = zip_longest(camera.distortion, coefficients, fillvalue=0.0)
+            if lens != camera.lens or not all(math.isclose(*pair, rel_tol=1e-4, abs_tol=1e-6) for pair in pairs):
+                differing.append("lens")
+    for key in differing[:1]:
+        fix = f"drop source=, or {key} from the sample"
+        raise SampleError(f"{key}: expected the calibration of source=, got another; {fix}")
 
 
-def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: tuple[int, ...]) -> Rig:
+def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any]) -> Rig:
     """The rig of the sample's K, cam2ego and, where present, lens, distortion and ground_z_m."""
     if missing := [key for key in ("K", "cam2ego") if sample.get(key) is None]:
         got = f"missing {', '.join(missing)}{hint(sample, missing)}; or give RigRetarget the rig as source="
         raise SampleError(f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', {got}")
-    K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
+    K, cam2ego = sample["K"], sample["cam2ego"]
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
         if array.shape != expected:
             fix = "; pass K[..., :3, :3]" if key == "K" and array.shape[1:] in ((3, 4), (4, 4)) else ""
-            got = f"{array.shape}{' in a frame of the batch' if index else ''}{fix}"
-            raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, got {got}")
+            raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, got {array.shape}{fix}")
     cameras = []
-    for k, (image, (lens, distortion)) in enumerate(zip(images, _lenses(sample, len(images), index), strict=True)):
+    for k, (image, (lens, distortion)) in enumerate(zip(images, _lenses(sample, len(images)), strict=True)):
         h, w = image.shape[-2:]
         if sample.get("coverage") is None:  # rendered views are cropped as their target asks
             _check_principal_point(k, K[k], (h, w))
         calibration: dict[str, Any] = {"K": K[k], "cam2ego": cam2ego[k], "lens": lens, "distortion": distortion}
         cameras.append(Camera(name=f"camera {k}", width_px=w, height_px=h, **calibration))
-    given = sample.get("ground_z_m")
-    ground_z_m = numbers("ground_z_m", 0.0 if given is None else given, index)
+    ground_z_m = np.zeros(()) if sample.get("ground_z_m") is None else sample["ground_z_m"]
     if ground_z_m.size != 1:
         raise SampleError(f"ground_z_m: expected one height for each frame, got shape {ground_z_m.shape}")
     return Rig(cameras, ground_z_m=float(ground_z_m.item()))
@@ -105,10 +100,9 @@ def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None
     raise SampleError(f"K[{k}]: expected a principal point {where} of (h, w) = {size}, got {got}")
 
 
-def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> list[tuple[Any, tuple[float, ...]]]:
+def _lenses(sample: Mapping[str, Any], count: int) -> list[tuple[Any, tuple[float, ...]]]:
     """Lens and coefficients of each camera, without the zeros that pad them to a common number."""
-    names, distortion = sample.get("lens"), sample.get("distortion")
-    coefficients = None if distortion is None else numbers("distortion", distortion, index)
+    names, coefficients = sample.get("lens"), sample.get("distortion")
     if names is None:
         if coefficients is not None and coefficients.any():
             expected = f"'lens' beside it, one of {', '.join(LENSES)} for each camera"
@@ -116,7 +110,9 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
         return [("pinhole", ())] * count
     if not isinstance(names, list | tuple) or len(names) != count:
         raise SampleError(f"lens: expected a list of {count} names, one for each camera, got {shown(names)}")
-    lenses = [_lens(name, index) for name in names]
+    if not all(isinstance(name, str) for name in names):
+        raise SampleTypeError(f"lens: expected names, one for each camera, got {shown(names)}")
+    lenses = list(map(canonical_name, names))
     if all(lens in LENSES and LENSES[lens].coefficient_counts == (0,) for lens in lenses):
         return [(lens, ()) for lens in lenses]
     if coefficients is None or coefficients.ndim != 2 or len(coefficients) != count:
@@ -127,49 +123,29 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
     return [(lens, tuple(row if any(row[count:]) else row[:count])) for lens, count, row in rows]
 
 
-def _lens(name: Any, index: tuple[int, ...]) -> str:
-    """The lens of a camera in one frame: ``default_collate`` makes lists of a batch's names."""
-    for i in index:
-        if isinstance(name, str):
-            break
-        if not isinstance(name, list | tuple) or not i < len(name):
-            raise SampleError(f"lens: expected a name for each frame of the batch, got {shown(name)}")
-        name = name[i]
-    if not isinstance(name, str):
-        raise SampleTypeError(f"lens: expected names, one for each camera, got {shown(name)}")
-    return canonical_name(name)
-
-
-def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], index: tuple[int, ...]) -> Rig:
+def _with_masks(rig: Rig, sample: Mapping[str, Any]) -> Rig:
     """The rig, masked where an earlier retargeting saw nothing (``coverage``) or its own car (``ego_mask``)."""
-    masks: list[BoolArray | None] = [camera.mask for camera in rig]
+    cameras = list(rig)
     for key in ("coverage", "ego_mask"):
         if sample.get(key) is None:
             continue
         try:
-            maps = entry(sample[key], lead, index)
-            hidden = [~m if key == "coverage" else m for m in maps]
-            for k, (camera, pixels) in enumerate(zip(rig, hidden, strict=True)):
+            for k, (camera, pixels) in enumerate(zip(cameras, sample[key], strict=True)):
                 if tuple(pixels.shape) != camera.size or pixels.dtype != torch.bool:
                     raise ValueError(f"got {pixels.dtype} {tuple(pixels.shape)}")
-                if pixels.any():
-                    visible, mask = ~pixels.cpu().numpy(), masks[k]
-                    masks[k] = visible if mask is None else mask & visible
+                visible = pixels if key == "coverage" else ~pixels
+                if not visible.all():
+                    mask = visible.cpu().numpy()
+                    cameras[k] = replace(camera, mask=mask if camera.mask is None else camera.mask & mask)
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:  # RuntimeError: meta, sparse
             expected = f"a bool tensor of each image's size, as an earlier retargeting gives it ({error})"
             raise SampleError(f"{key}: expected {expected}; rename the key if it is something else") from None
-    if all(mask is camera.mask for mask, camera in zip(masks, rig, strict=True)):
-        return rig
-    return rig.with_cameras([replace(camera, mask=mask) for camera, mask in zip(rig, masks, strict=True)])
+    return rig if all(map(operator.is_, cameras, rig)) else rig.with_cameras(cameras)
 
 
-def numbers(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
-    """An entry of a sample as a float64 array, at an ``index`` into its leading dimensions; scalars hold for all."""
-    array = np.asarray(as_array(key, value), np.float64)
-    try:
-        return np.asarray(array[index]) if array.ndim else array
-    except IndexError:
-        raise SampleError(f"{key}: expected the images' leading dimensions, got shape {array.shape}") from None
+def numbers(key: str, value: Any) -> FloatArray:
+    """An entry of a sample as a float64 array."""
+    return np.asarray(as_array(key, value), np.float64)
 
 
 def as_array(key: str, value: Any) -> Points:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, islice, pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,7 +15,11 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cameras.validation import Finding, likely_poses, pose_doubt
+from arbiview_aug.cameras.validation import Finding, doubts, is_rigid, likely_poses, pose_doubt
+from arbiview_aug.sample.calibration import as_array
+from arbiview_aug.sample.frame import Frame
+from arbiview_aug.sample.inputs import camera_findings
+from arbiview_aug.sample.masks import CLEANING, without_specks
 from arbiview_aug.scene.surface import Points
 
 Gray = npt.NDArray[np.float32]
@@ -104,72 +108,53 @@ def fit_findings(rig: Rig, views: Sequence[tuple[Camera, Gray]], points: Points)
 DISAGREE_DEG, _LEAST_MATCHES = 1.0, 15
 """Angle of a mistake, above that of cameras that fire apart while the car moves; least number of matches."""
 
-_VIEW_PX, _RATIO, _NEAREST_M, _FALSE_DEG = 800, 0.8, 2.0, 10.0
-"""Size of the common view; Lowe's ratio; the nearest scene; matches farther apart are false."""
+_WIDTH_PX, _RATIO, _NEAREST_M, _FALSE_DEG = 800, 0.8, 2.0, 10.0
+"""Width of the images; Lowe's ratio; the nearest scene; matches farther apart are false."""
+
+
+class Features(NamedTuple):
+    """SIFT features of one camera's image."""
+
+    camera: Camera
+    directions: FloatArray  # (n, 3) in the ego frame
+    descriptors: np.ndarray  # (n, 128) float32
 
 
 def neighbour_errors(rig: Rig, images: Sequence[torch.Tensor]) -> dict[tuple[str, str], FloatArray]:
     """Angles in degrees by which matches in the overlap of two cameras miss each other at any distance of the scene."""
-    errors = {}
-    for first, second in combinations(zip(rig, images, strict=True), 2):
-        view = _common_view(first[0], second[0])
-        if view is not None and len(found := _match_errors(view, first, second)) >= _LEAST_MATCHES:
-            errors[first[0].name, second[0].name] = found
-    return errors
+    features = [_features(*gray(camera, image, _WIDTH_PX)) for camera, image in zip(rig, images, strict=True)]
+    errors = {(a.camera.name, b.camera.name): _match_errors(a, b) for a, b in combinations(features, 2)}
+    return {names: found for names, found in errors.items() if len(found) >= _LEAST_MATCHES}
 
 
-def _common_view(camera: Camera, other: Camera) -> Camera | None:
-    """An upright pinhole camera that looks at what both see far away; None without overlap."""
-    u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 24), np.linspace(0, camera.height_px - 1, 24))
-    rays = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
-    directions = rays.directions[rays.valid]
-    seen = other.project(other.center_m + directions)
-    directions = directions[seen.valid & other.contains(seen.uv)]
-    if len(directions) < 8:
-        return None
-    x, y, z = directions.mean(axis=0)
-    azimuth, elevation = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
-    size: dict[str, Any] = {"width_px": 8, "height_px": 8, "horizontal_fov_deg": 90}
-    view = Camera.looking(name="view", azimuth_deg=azimuth, elevation_deg=elevation, **size)
-    x, y, z = (directions @ view.cam2ego[:3, :3]).T
-    ahead = z > 0.3
-    if not ahead.any():
-        return None
-    half = np.minimum([np.abs(x[ahead] / z[ahead]).max(), np.abs(y[ahead] / z[ahead]).max()], 1.1) * 1.1
-    f = min(camera.K[0, 0], other.K[0, 0], *(_VIEW_PX / 2 / half))
-    w, h = np.maximum(2 * half * f, 16).astype(int)
-    K = np.array([[f, 0, w / 2 - 0.5], [0, f, h / 2 - 0.5], [0, 0, 1]])
-    return replace(view, width_px=int(w), height_px=int(h), K=K)
+def _features(camera: Camera, pixels: Gray) -> Features:
+    mask = None if camera.mask is None else camera.mask.astype(np.uint8)
+    points, descriptors = cv2.SIFT.create().detectAndCompute(pixels.astype(np.uint8), mask)
+    if not points:
+        return Features(camera, np.zeros((0, 3)), np.zeros((0, 128), np.float32))
+    rays = camera.unproject(np.array([point.pt for point in points]))
+    return Features(camera, rays.directions[rays.valid], descriptors[rays.valid])
 
 
-def _match_errors(view: Camera, *pair: tuple[Camera, torch.Tensor]) -> FloatArray:
-    """Errors in degrees of mutual matches of SIFT features in both images, as turned into the view."""
-    sift, matcher = cv2.SIFT.create(1000), cv2.BFMatcher()
-    keys, features = [], []
-    directions = view.unproject(view.pixel_grid()).directions
-    for camera, image in pair:
-        camera, pixels = gray(camera, image, camera.width_px)
-        seen = camera.project(camera.center_m + directions)
-        valid = seen.valid & camera.contains(seen.uv)
-        u, v = np.moveaxis(np.where(valid[..., None], seen.uv, -9).astype(np.float32), -1, 0)
-        turned = cv2.remap(pixels.astype(np.uint8), u, v, cv2.INTER_LINEAR)
-        if camera.mask is not None:
-            valid &= cv2.remap(camera.mask.astype(np.uint8), u, v, cv2.INTER_NEAREST) > 0
-        points, found = sift.detectAndCompute(turned, cv2.erode(valid.astype(np.uint8) * 255, np.ones((9, 9))))
-        if len(points) < 2:
+def _match_errors(*pair: Features) -> FloatArray:
+    """Errors in degrees of mutual matches in the overlap of two images; empty if too few agree."""
+    directions, descriptors = [], []
+    for features, other in (pair, pair[::-1]):
+        seen = other.camera.project(other.camera.center_m + features.directions)
+        overlap = seen.valid & other.camera.contains(seen.uv)
+        if overlap.sum() < _LEAST_MATCHES:
             return np.zeros(0)
-        keys.append(np.array([point.pt for point in points]))
-        features.append(found)
+        directions.append(features.directions[overlap])
+        descriptors.append(features.descriptors[overlap])
     ways = []
-    for a, b in (features, features[::-1]):
-        matches = (best for best, other in matcher.knnMatch(a, b, k=2) if best.distance < _RATIO * other.distance)
-        ways.append({(match.queryIdx, match.trainIdx) for match in matches})
+    for a, b in (descriptors, descriptors[::-1]):
+        nearest = cv2.BFMatcher().knnMatch(a, b, k=2)
+        ways.append({(m.queryIdx, m.trainIdx) for m, other in nearest if m.distance < _RATIO * other.distance})
     both = [(a, b) for a, b in ways[0] if (b, a) in ways[1]]
-    if not both:
+    if len(both) < _LEAST_MATCHES:
         return np.zeros(0)
-    rows = map(list, zip(*both, strict=True))
-    first, second = (view.unproject(points[row]).directions for points, row in zip(keys, rows, strict=True))
-    apart = pair[1][0].center_m - pair[0][0].center_m
+    first, second = (there[list(rows)] for there, rows in zip(directions, zip(*both, strict=True), strict=True))
+    apart = pair[1].camera.center_m - pair[0].camera.center_m
     at = first - np.linspace(0, 1 / _NEAREST_M, 40)[:, None, None] * apart
     cosine = (at / np.linalg.norm(at, axis=-1, keepdims=True) * second).sum(axis=-1)
     errors = np.degrees(np.arccos(np.clip(cosine, -1, 1))).min(axis=0)
@@ -192,6 +177,8 @@ _ROAD_AHEAD_M, _FLOW_PX, _GRADIENT, _STEADY = 12.0, 3.0, 3.0, 0.85
 by the second. The edge's mean gradient is at least the third, in grey levels a pixel, and at least the fourth of the
 mean of the frames' gradients."""
 
+_MOVED = 0.5  # largest change of one vehicle's poses: some data sets add its way between the cameras' times
+_LEAST_FRAMES = 3  # that show the own car
 _LEAST_WIDTH = 0.2
 """Least length of such an edge as a share of the width, above that of edges in moving traffic."""
 
@@ -227,3 +214,46 @@ def own_car_share(
     longest[0] = False
     below = np.maximum.accumulate(longest[labels] & (edges > 0), axis=0)
     return float(below.mean())
+
+
+def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
+    """Cameras without a mask that see their moving vehicle, in frames with poses."""
+    first, rigs = frames[0].rig, [frame.rig for frame in frames]
+    poses = [pose for frame in frames if (pose := ego_pose(frame)) is not None]
+    same = all(rig.names == first.names and rig.sizes == first.sizes for rig in rigs)
+    same = same and all(np.allclose(rig.cam2ego, first.cam2ego, atol=_MOVED) for rig in rigs)
+    findings = []
+    for k, camera in enumerate(first if same and len(poses) == len(frames) >= _LEAST_FRAMES else ()):
+        images = [frame.images[k] for frame in frames]
+        if camera.mask is None and (share := own_car_share(camera, images, poses, first.ground_z_m)):
+            found = f"no mask, and edges that stay while the road moves: about {share:.0%} of the image"
+            fix = "mask it in the rig file: True on the scene"
+            findings.append(Finding(f"camera {camera.name!r}: mask", "a mask that hides the own car", found, fix))
+    return findings
+
+
+def ego_pose(frame: Frame) -> FloatArray | None:
+    """The frame's ``ego2world`` (4, 4); None without one, or if it is no pose: only neighbours need one."""
+    pose = frame.further.get("ego2world")
+    pose = None if pose is None else np.asarray(as_array("ego2world", pose), np.float64)
+    return pose if pose is not None and is_rigid(pose) else None
+
+
+# --- a rig ------------------------------------------------------------------------------------------------------------
+_MOST_HIDDEN = 0.9  # of an image by its mask; a fisheye's rim hides up to a half
+
+
+def check_rig(rig: Rig, images: Sequence[torch.Tensor] = (), *, masks: bool = True) -> list[Finding]:
+    """Mistakes in poses, intrinsics, images' rims and, if ``masks``, masks of a rig."""
+    findings = [*doubts(rig.cameras, rig.ground_z_m), *camera_findings(rig, images)]
+    for camera in rig:
+        if camera.mask is None or not masks:
+            continue
+        where = f"camera {camera.name!r}: mask"
+        if turned := int((without_specks(camera.mask) != camera.mask).sum()):
+            findings.append(Finding(where, "whole regions", f"specks of {turned} pixels", f"clean it: {CLEANING}"))
+        hidden, upper = (1 - mask.mean() for mask in (camera.mask, camera.mask[: camera.height_px // 3]))
+        if hidden > _MOST_HIDDEN or (upper > 0.8 > hidden):
+            share = f"{hidden:.0%} of the image" if hidden > _MOST_HIDDEN else f"{upper:.0%} of the upper third"
+            findings.append(Finding(where, "True on the scene", f"{share} hidden", "pass ~mask"))
+    return findings

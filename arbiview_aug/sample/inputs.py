@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,10 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.random_rig import names_in
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.validation import Finding
 from arbiview_aug.errors import SampleError, SampleTypeError, WarnOnce
-from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
-from arbiview_aug.sample.calibration import CHECKED_KEYS, as_array, differing_keys, read_rig
+from arbiview_aug.sample.batching import check_container, checked_images, leading_shape, split
+from arbiview_aug.sample.calibration import NUMBERS, as_array, check_source, numbers, read_rig
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.masks import CLEANING, dark_rims
 from arbiview_aug.sample.neighbours import Warn, read_neighbours
@@ -44,6 +45,10 @@ _MOST_FOCALS = 20  # of a side: 169 degrees of a pinhole image, and more than an
 DEPTH_KEYS = ("depth_m", MOTION_KEY, LEARNED_KEY)
 _SAMPLE_KEYS = {"boxes": "boxes_3d", "points": "points", "motion": MOTION_KEY}
 """Sample keys of the geometry that has a field in ``Scene``; others are read under their own name."""
+
+_OF_CAMERAS = (*DEPTH_KEYS, "coverage", "ego_mask")  # tensors, or lists of one for each camera
+_ARRAYS = (*NUMBERS, "ego2world", "time_s")
+_FIELDS = {"points", "boxes_3d", "neighbours", *DEPTH_KEYS}  # of ``Frame``
 
 _EXPECTED = {
     "boxes": "'boxes_3d' (B, 7) in the sample, got none; pass an empty (0, 7) tensor if there are no objects",
@@ -88,46 +93,54 @@ def read_frames(
     lead = leading_shape(images)
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
-    frames, places = [], list(np.ndindex(*lead))
-    for index, views in zip(places, split("images", images, lead), strict=True):
-        checked = checked_images(views)
-        frames.append(Frame(checked, read_rig(checked, sample, source, lead, index)))
-    if source is not None and sample.get("rig") is None and not CHECKED_KEYS.isdisjoint(sample):
-        for key in differing_keys(source, sample, lead):
-            fix = f"drop source=, or {key} from the sample"
-            raise SampleError(f"{key}: expected the calibration of source=, got another; {fix}")
+    checked = [checked_images(views) for views in split("images", images, lead)]
     row = GEOMETRIES[geometry]
     if row.needs not in (None, "motion"):  # only moved cameras need depth from motion
         key = _SAMPLE_KEYS.get(row.needs, row.needs)
         if sample.get(key) is None and (row.needs != "points" or sample.get("depth_m") is None):
             expected = _EXPECTED.get(row.needs, f"{row.needs!r} in the sample, got none")
             raise SampleError(f"geometry={geometry!r}: expected {expected}{hint(sample, (key,))}")
-    wanted = [*(_SAMPLE_KEYS.get(name, name) for name in row.reads), *sorted(further)]
+    wanted = {*(_SAMPLE_KEYS.get(name, name) for name in row.reads), *further}
+    keys = {*wanted, "coverage", "ego_mask", *(() if sample.get("rig") is not None else (*NUMBERS, "lens"))}
     if "neighbours" in wanted and sample.get("neighbours") is not None:
-        wanted.append("boxes_3d")  # they tell what moved
-    entries = {key: _entries(key, sample[key], lead) for key in wanted if sample.get(key) is not None}
+        keys |= {"boxes_3d", "ego2world", "time_s"}  # boxes tell what moved
+    entries = {key: _entries(key, sample[key], lead) for key in sorted(keys) if sample.get(key) is not None}
     entries |= {key: _names(key, sample[key], lead) for key in names if sample.get(key) is not None}
-    for k, (frame, index) in enumerate(zip(frames, places, strict=True)):
-        values = {key: frame_values[k] for key, frame_values in entries.items()}
-        depth = {key: values.pop(key) for key in DEPTH_KEYS if key in values}
-        neighbours, points, boxes = (values.pop(key, None) for key in ("neighbours", "points", "boxes_3d"))
-        frame = replace(frame, points=points, boxes=boxes, depth=depth, further=values)
-        if neighbours is not None:
-            frame = replace(frame, neighbours=read_neighbours(frame, neighbours, sample, index, warn or WarnOnce()))
-        frames[k] = frame
+    frames = []
+    for k, views in enumerate(checked):
+        given = {key: values[k] for key, values in entries.items()}
+        frame_sample = {**sample, **given}  # errors look for misnamed keys in it
+        rig = read_rig(views, frame_sample, source)
+        if source is not None and sample.get("rig") is None:
+            check_source(source, frame_sample)
+        frame = Frame(
+            views,
+            rig,
+            points=given.get("points"),
+            boxes=given.get("boxes_3d"),
+            depth={key: given[key] for key in DEPTH_KEYS if key in given},
+            further={key: value for key, value in given.items() if key in {*wanted, *names} - _FIELDS},
+        )
+        if "neighbours" in given:
+            neighbours = read_neighbours(frame, given["neighbours"], frame_sample, warn or WarnOnce())
+            frame = replace(frame, neighbours=neighbours)
+        frames.append(frame)
     return frames
 
 
 def _entries(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
-    """Entry of each frame of a (*lead, ...) tensor, or of a list over frames (of depth maps, over cameras)."""
-    if key in DEPTH_KEYS:
-        try:
-            return [entry(value, lead, index) for index in np.ndindex(*lead)]
-        except (AttributeError, TypeError, ValueError, RuntimeError) as error:
-            raise SampleError(f"{key}: expected one map (H, W) for each image ({error})") from None
-    count, is_list = math.prod(lead), isinstance(value, list | tuple)
-    if not lead:
-        return [value]
+    """Entry of each frame, without leading dimensions."""
+    count = math.prod(lead)
+    if key in _OF_CAMERAS:
+        return split(key, value, lead)
+    if key == "lens":
+        names = np.array(value, dtype=object)  # ``default_collate`` makes lists of a batch's names
+        return names.reshape(-1, count).T.tolist() if lead and names.shape[1:] == lead else [value] * count
+    if key in _ARRAYS:
+        value = numbers(key, value)
+    if not lead or (key in _ARRAYS and not value.ndim):
+        return [value] * count
+    is_list = isinstance(value, list | tuple)
     if is_list and len(value) == count:
         return list(value)
     if not is_list and tuple(getattr(value, "shape", ()))[: len(lead)] == lead:
@@ -243,27 +256,12 @@ def check_other_keys(
             except (AttributeError, TypeError, RuntimeError):  # RuntimeError: nested tensors
                 continue
             if any(pair in sizes for pair in pairwise(shape)):
-                raise SampleError(f"{key}: shape {shape} looks like {_stale_map(key, value, leaf, sample['images'])}")
+                stale = f"{key}: shape {shape} looks like pixels of the source's cameras, which would be stale"
+                keep = f"drop the key, or keep it as it is by SampleKeys(keep=({key!r},))"
+                other = f"label maps belong under one key, in SampleKeys(labels=({key!r},)); {_OTHER_FRAMES}"
+                other = f"{_DEPENDS}; {_DEPTH}" if _CAMERA_VALUE.fullmatch(str(key)) else other
+                raise SampleError(f"{stale}; {keep}; {other}")
     return labels
-
-
-def _stale_map(key: Any, value: Any, leaf: Any, images: Any) -> str:
-    """Describe a leaf of an entry that has the images' height and width, and the fix."""
-    shape = tuple(leaf.shape)
-    image = images[0] if isinstance(images, list | tuple) else images
-    is_nested = leaf is not value and not (isinstance(value, list | tuple) and any(leaf is part for part in value))
-    has_colours = shape[-3:-2] == (3,) and (len(shape) > 3 or leaf is not value)  # not the maps of three cameras
-    if has_colours and str(getattr(leaf, "dtype", "")).removeprefix("torch.") == str(image.dtype)[len("torch.") :]:
-        label = "" if is_nested else f"; if they are label maps, name them in SampleKeys(labels=({key!r},))"
-        return f"images of the source's cameras and would be stale; {_OTHER_FRAMES}; otherwise drop the key{label}"
-    keep = f"SampleKeys(keep=({key!r},)) to keep it as it is"
-    stale = "a map over the source's pixels and would be stale"
-    if _CAMERA_VALUE.fullmatch(str(key)):
-        return f"{stale}; {_DEPENDS}: drop the key, or name it in {keep}; {_DEPTH}"
-    if is_nested:
-        label = "a label map needs a key of its own, named in SampleKeys(labels=...)"
-        return f"{stale}; {label}; {_OTHER_FRAMES}; otherwise drop the key, or name it in {keep}"
-    return f"{stale}; name it in SampleKeys(labels=({key!r},)) to render it, or in {keep}"
 
 
 def _tv_tensor(value: Any) -> str:
@@ -283,41 +281,33 @@ def _leaves(value: Any) -> Iterator[Any]:
             waiting += reversed([*entry.values()] if isinstance(entry, Mapping) else entry[:_MAX_ENTRIES])
 
 
-def misnamed_keys(sample: Mapping[str, Any], calibrated: bool, static: bool = False) -> dict[str, str]:
-    """Keys that are probably misnamed and would not be read, and the names that are meant.
+# --- findings ---------------------------------------------------------------------------------------------------------
+def misnamed_keys(sample: Mapping[str, Any], calibrated: bool, static: bool = False) -> list[Finding]:
+    """Keys that are probably misnamed and would not be read.
 
     If ``calibrated``, a rig replaces ``lens``, ``distortion`` and ``ground_z_m``; if ``static``, no ego-frame key is
     used.
     """
     lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
     keys = misnamed(sample, ("neighbours", *lenses, *(() if static else (*EGO_KEYS, "depth_m"))))
-    return {wrong: meant for wrong, meant in keys.items() if wrong not in PIXEL_BOUND_KEYS}
+    seen, fix = "a key that is not read", "Rename it, as RigRetarget documents it, or name it in SampleKeys(keep=...)"
+    return [
+        Finding(wrong, f"the name {meant!r}", seen, f"did you mean {meant}? {fix}")
+        for wrong, meant in keys.items()
+        if wrong not in PIXEL_BOUND_KEYS
+    ]
 
 
-def warn_of_misnamed(
-    sample: Mapping[str, Any], calibrated: bool, static: bool, named: Sequence[str], warn: Callable[[str, str], None]
-) -> None:
-    """Warn, by topic and message, of ``misnamed_keys`` that are not ``named`` on purpose."""
-    for wrong, meant in misnamed_keys(sample, calibrated, static).items():
-        if wrong not in named:
-            message = f"the sample's {wrong!r} is not read; did you mean {meant!r}?"
-            fix = "Rename it, as RigRetarget documents it, or name it in SampleKeys(keep=...)"
-            warn(f"key {wrong}", f"{message} {fix}")
-
-
-def focal_mistake(camera: Camera) -> tuple[str, str] | None:
-    """Mistake of a focal length that is too short for pixels, as (found, fix); None if it is plausible."""
-    f, size = camera.K[0, 0], min(camera.size)
-    if size < _MOST_FOCALS * f:
-        return None
-    return f"{f:g} px for an image with a side of {size} px", "is K in millimetres, or normalised? It is in pixels"
-
-
-def warn_of_cameras(frames: Sequence[Frame], warn: Callable[[str, str], None]) -> None:
-    """Warn, by topic and message, of focal lengths in another unit, and of dark fisheye rims that no mask hides."""
-    for camera in chain.from_iterable(frame.rig for frame in frames):
-        if mistake := focal_mistake(camera):
-            warn("focal", f"camera {camera.name!r}: K: a focal length of {'; '.join(mistake)}")
-    for camera, _ in (rim for frame in frames for rim in dark_rims(frame.rig, frame.images)):
-        warn("rim", f"camera {camera.name!r}: the dark rim of the image is read as scene; mask it: {CLEANING}")
-        return
+def camera_findings(cameras: Iterable[Camera], images: Sequence[torch.Tensor] = ()) -> Iterator[Finding]:
+    """Focal lengths that are too short for pixels and, with images, dark fisheye rims that no mask hides."""
+    cameras = list(cameras)
+    for camera in cameras:
+        f, side = camera.K[0, 0], min(camera.size)
+        if side >= _MOST_FOCALS * f:
+            found = f"{f:g} px for an image with a side of {side} px"
+            fix = "is K in millimetres, or normalised? It is in pixels"
+            yield Finding(f"camera {camera.name!r}: K", "a focal length in pixels", found, fix)
+    for camera, circle in dark_rims(cameras, images) if images else ():
+        expected = "a mask that hides the dark rim around the image circle"
+        found = f"no mask, and {1 - circle.holds(camera).mean():.0%} of the image that would be read as scene"
+        yield Finding(f"camera {camera.name!r}: image", expected, found, f"mask it: {CLEANING}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -116,9 +116,9 @@ def _circle(points: FloatArray) -> tuple[FloatArray, float]:
     return np.array([x, y]), float(np.sqrt(max(c + x * x + y * y, 0.0)))
 
 
-def dark_rims(rig: Rig, images: Sequence[torch.Tensor]) -> Iterator[tuple[Camera, Circle]]:
+def dark_rims(cameras: Iterable[Camera], images: Sequence[torch.Tensor]) -> Iterator[tuple[Camera, Circle]]:
     """Cameras without a mask whose images (3, h, w) have a dark rim, and their image circles."""
-    for camera, image in zip(rig, images, strict=True):
+    for camera, image in zip(cameras, images, strict=True):
         if camera.mask is None and (circle := image_circle(camera, image)) is not None:
             yield camera, circle
 

@@ -16,7 +16,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_rigid
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError, shown
-from arbiview_aug.sample.calibration import as_array, numbers, read_rig
+from arbiview_aug.sample.calibration import NUMBERS, as_array, numbers, read_rig
 from arbiview_aug.sample.frame import Frame, Neighbour
 from arbiview_aug.scene.boxes import checked_boxes, moved_by, points_in
 from arbiview_aug.scene.surface import Points
@@ -33,22 +33,19 @@ _MAX_MOUNTING_M, _MAX_MOUNTING_DEG = 1.5, 10.0
 Warn = Callable[[str, str], None]  # warns of a topic with a message, once per topic
 
 
-def read_neighbours(
-    frame: Frame, entries: Any, sample: Mapping[str, Any], index: tuple[int, ...], warn: Warn
-) -> tuple[Neighbour, ...]:
-    """Read the neighbours of a frame at an ``index`` of a sample, nearest first, of two at one distance the one behind.
+def read_neighbours(frame: Frame, entries: Any, sample: Mapping[str, Any], warn: Warn) -> tuple[Neighbour, ...]:
+    """Read the neighbours of a frame, nearest first, of two at one distance the one behind.
 
-    ``entries`` is a list of mappings, each another frame of the same rig: ``images``; ``ego2ego`` (4, 4), its ego frame
-    to the current one, or ``ego2world`` as in the sample; optionally ``points`` and ``boxes_3d`` in its own ego frame,
-    ``time_s``, ``token``, and its calibration where it differs. K and cam2ego alone keep the current lenses and masks.
-    Without ``boxes_3d``, the sample's are moved by their velocities (columns 7 and 8, m/s in the ego frame) if both
-    frames have a time and all velocities are finite.
+    ``sample`` is the frame's, without leading dimensions. ``entries`` is a list of mappings, each another frame of the
+    same rig: ``images``; ``ego2ego`` (4, 4), its ego frame to the current one, or ``ego2world`` as in the sample;
+    optionally ``points`` and ``boxes_3d`` in its own ego frame, ``time_s``, ``token``, and its calibration where it
+    differs. K and cam2ego alone keep the current lenses and masks. Without ``boxes_3d``, the sample's are moved by
+    their velocities (columns 7 and 8, m/s in the ego frame) if both frames have a time and all velocities are finite.
 
     Frames at the same place are left out silently, unusable ones with a warning.
     """
     if not isinstance(entries, list | tuple):
-        expected = f"a list of frames{' for each frame of the batch' if index else ''}"
-        raise SampleTypeError(f"neighbours: expected {expected}, got {type(entries).__name__}")
+        raise SampleTypeError(f"neighbours: expected a list of frames, got {type(entries).__name__}")
     if len(entries) > MAX_NEIGHBOURS:
         raise SampleError(f"neighbours: expected at most {MAX_NEIGHBOURS} for a frame, got {len(entries)}")
     boxes, neighbours = None if frame.boxes is None else as_array("boxes_3d", frame.boxes), []
@@ -56,7 +53,7 @@ def read_neighbours(
         token = entry.get("token") if isinstance(entry, Mapping) else None
         name = str(number) if token is None else shown(token)
         try:
-            neighbours.append(_neighbour(frame, boxes, entry, sample, index, number, name))
+            neighbours.append(_neighbour(frame, boxes, entry, sample, number, name))
         except (ArbiviewError, OSError) as error:
             _warn_lost(warn, name, error)
     moved = [neighbour for neighbour in neighbours if neighbour is not None]
@@ -89,7 +86,7 @@ def _warn_lost(warn: Warn, name: str, error: Exception) -> None:
 
 
 def _neighbour(
-    frame: Frame, current: Points | None, entry: Any, sample: Mapping[str, Any], index: Any, number: int, name: str
+    frame: Frame, current: Points | None, entry: Any, sample: Mapping[str, Any], number: int, name: str
 ) -> Neighbour | None:
     if not isinstance(entry, Mapping):
         raise SampleTypeError(f"expected a mapping with images and a pose, got {type(entry).__name__}")
@@ -99,10 +96,10 @@ def _neighbour(
         missing = [where for where, keys in (("it", entry), ("the sample", sample)) if keys.get("ego2world") is None]
         if missing:
             raise SampleError(f"expected ego2ego (4, 4), or ego2world here and in the sample; {missing[-1]} has none")
-        here, there = _pose("ego2world", sample["ego2world"], index), _pose("ego2world", entry["ego2world"])
+        here, there = _pose("ego2world", sample["ego2world"]), _pose("ego2world", entry["ego2world"])
         ego2ego = np.asarray(np.linalg.solve(here, there), np.float64)
     travel_m, turned_deg = float(np.linalg.norm(ego2ego[:3, 3])), _angle_deg(ego2ego[:3, :3])
-    seconds = _checked_seconds(sample, index, entry, ego2ego, travel_m)
+    seconds = _checked_seconds(sample, entry, ego2ego, travel_m)
     if travel_m < STILL_M and turned_deg < STILL_DEG:
         return None
     cameras = [camera.moved(ego2ego) for camera in _checked_rig(frame, entry)]
@@ -113,11 +110,11 @@ def _neighbour(
 
 def _checked_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
     """The neighbour's cameras, of the current images' sizes, in its ego frame; SampleError for another rig's."""
-    source, is_whole = entry, entry.get("rig") is not None or (entry.get("K") is None and entry.get("cam2ego") is None)
-    if entry.get("K") is None and not is_whole:
-        source = {**entry, "K": frame.rig.K}
+    is_whole = entry.get("rig") is not None or (entry.get("K") is None and entry.get("cam2ego") is None)
+    given = {key: numbers(key, entry[key]) for key in NUMBERS if entry.get(key) is not None}
+    rig = read_rig(frame.images, {**entry, "K": frame.rig.K, **given}, frame.rig if is_whole else None)
     cameras = []
-    for moved, camera in zip(read_rig(frame.images, source, frame.rig if is_whole else None), frame.rig, strict=True):
+    for moved, camera in zip(rig, frame.rig, strict=True):
         if not is_whole:
             lens, mask = moved if entry.get("lens") is not None else camera, moved.mask
             mask = camera.mask if mask is None else mask
@@ -134,9 +131,8 @@ def _checked_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
     return frame.rig.with_cameras(cameras)
 
 
-def _pose(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
+def _pose(key: str, value: Any) -> FloatArray:
     pose = numbers(key, value)
-    pose = numbers(key, pose, index) if pose.ndim > 2 else pose
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise SampleError(f"{key}: expected (4, 4) finite numbers, got shape {pose.shape}")
     if not is_rigid(pose):
@@ -145,12 +141,12 @@ def _pose(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
 
 
 def _checked_seconds(
-    sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[str, Any], ego2ego: FloatArray, travel_m: float
+    sample: Mapping[str, Any], entry: Mapping[str, Any], ego2ego: FloatArray, travel_m: float
 ) -> float | None:
     """Time from the current frame to this one, None if either has no time; poses that no drive has are refused."""
     seconds = None
     if sample.get("time_s") is not None and entry.get("time_s") is not None:
-        here, there = numbers("time_s", sample["time_s"], index), numbers("time_s", entry["time_s"])
+        here, there = numbers("time_s", sample["time_s"]), numbers("time_s", entry["time_s"])
         if here.size != 1 or there.size != 1 or not np.isfinite([here.item(), there.item()]).all():
             raise SampleError("time_s: expected one finite number of seconds, here and in the sample")
         seconds = float(there.item() - here.item())

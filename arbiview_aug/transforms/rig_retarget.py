@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache, cached_property, wraps
+from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
 
@@ -31,11 +32,11 @@ from arbiview_aug.render.requirements import needs_geometry
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import (
     DEPTH_WORDS,
+    camera_findings,
     check_other_keys,
+    misnamed_keys,
     read_frames,
     refuse_camera_values,
-    warn_of_cameras,
-    warn_of_misnamed,
 )
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.outputs import SampleWriter
@@ -282,8 +283,10 @@ class RigRetarget(torch.nn.Module):
         if types not in self._checked:
             calibrated = sample.get("rig") is not None or self.source is not None
             reads_ego_frame = not GEOMETRIES[self.geometry].is_static or self.keys.frame == "target"
-            warn_of_misnamed(sample, calibrated, not reads_ego_frame, (*self.keys.labels, *self.keys.keep), self._warn)
-            warn_of_cameras(frames, self._warn)
+            findings = misnamed_keys(sample, calibrated, not reads_ego_frame)
+            findings = [key for key in findings if key.where not in (*self.keys.labels, *self.keys.keep)]
+            for finding in chain(findings, *(camera_findings(frame.rig, frame.images) for frame in frames)):
+                self._warn(finding.expected, str(finding))  # once for all cameras
             self._checked.add(types)
         labels = check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)
         refuse_camera_values(labels)  # masks of torchvision, too

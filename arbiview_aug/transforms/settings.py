@@ -18,7 +18,7 @@ from arbiview_aug.environment import imported
 from arbiview_aug.errors import GeometryWarning, SampleError, WarnOnce, shown
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
 from arbiview_aug.render.plan import PRESETS, RenderConfig
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS, focal_mistake
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, camera_findings
 
 T = TypeVar("T")
 
@@ -200,11 +200,11 @@ def _lost(camera: Camera, size: tuple[int, int], fit: Fit) -> str:
 def warn_of_target(target: Rig, warn: WarnOnce) -> None:
     """Warn once of target cameras that no vehicle has."""
     for camera, mounted in zip(target, is_mounted(target.cam2ego, target.ground_z_m), strict=True):
-        where = f"target camera {camera.name!r}"
         if not mounted:
             x, y, z = camera.center_m - (0, 0, target.ground_z_m)
             got = f"({x:.1f}, {y:.1f}) m, {z:.1f} m above the road; are moves and poses in metres?"
-            warn("mounting", f"{where}: expected a place on a vehicle, got {got}", GeometryWarning)
-        if mistake := focal_mistake(camera):
-            got = "; ".join(mistake)
-            warn("target focal", f"{where}: K: expected a focal length in pixels, got {got}", GeometryWarning)
+            warn(
+                "mounting", f"target camera {camera.name!r}: expected a place on a vehicle, got {got}", GeometryWarning
+            )
+    for finding in camera_findings(target):
+        warn("target focal", f"target {finding}", GeometryWarning)

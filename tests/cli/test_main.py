@@ -12,7 +12,6 @@ import sys
 import warnings
 from collections.abc import Iterator
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, get_args
 
@@ -305,14 +304,11 @@ def test_two_wheels_are_a_problem(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert re.search("^PROBLEM: OpenCV: .*pip uninstall -y opencv-python ", capsys.readouterr().out, re.MULTILINE)
 
 
-def test_kernels_that_are_whole_damaged_and_missing(tmp_path: Path) -> None:
+def test_kernels_that_are_kept_or_not(tmp_path: Path) -> None:
     folder = tmp_path / "room" / "__pycache__"
     folder.mkdir(parents=True)
     assert doctor._kernels(None) == (False, "compiled kernels: not kept; set NUMBA_CACHE_DIR to a writable folder")
-    is_fine, text = doctor._kernels(str(folder))
-    assert is_fine and text.startswith(f"compiled kernels: 0 files in {tmp_path}; the first frames wait")
-    (folder / "kernels.sha256.nbi").write_bytes(b"index" + sha256(b"index").digest())
-    (folder / "kernels.sha256.1.nbc").write_bytes(b"code" + sha256(b"other").digest())
-    is_fine, text = doctor._kernels(str(folder))
-    assert not is_fine and "1 files" in text and "1 damaged files are deleted" in text
-    assert [path.name for path in folder.iterdir()] == ["kernels.sha256.nbi"] and doctor._kernels(str(folder))[0]
+    none = f"compiled kernels: 0 files in {tmp_path}; the first frames wait for them"
+    assert doctor._kernels(str(folder)) == (True, none)
+    (folder / "kernels.sha256.nbi").write_bytes(b"index")
+    assert doctor._kernels(str(folder)) == (True, f"compiled kernels: 1 files in {tmp_path}")

@@ -222,7 +222,7 @@ def test_streets_are_those_that_all_numbers_are_of(scene: tuple[int, int]) -> No
 # --- which frames of a drive are neighbours, and that they are read late or, broken, not at all -----------------------
 def test_frames_are_picked_by_distance() -> None:
     """It stood still between 3 and 4."""
-    drive = Drive(np.array([0.0, 1.0, 2.5, 4.0, 4.0, 5.5, 7.0])[:, None] * [1, 0, 0], np.zeros(7, np.int64))
+    drive = Drive(range(7), np.array([0.0, 1.0, 2.5, 4.0, 4.0, 5.5, 7.0])[:, None] * [1, 0, 0], np.zeros(7, np.int64))
     for wanted, expected in (
         (Neighbours(), [2, 5]),
         (Neighbours(count=2), [2, 1, 5, 6]),
@@ -248,7 +248,7 @@ def test_standing_still_has_no_neighbours() -> None:
     """Though its poses waver: their steps alone would add up to 4 m."""
     positions_m = 0.005 * np.random.default_rng(0).standard_normal((500, 3))
     assert np.linalg.norm(np.diff(positions_m, axis=0), axis=1).sum() > 4
-    drive = Drive(positions_m, np.zeros(500, np.int64))
+    drive = Drive(range(500), positions_m, np.zeros(500, np.int64))
     assert drive.neighbours(250, Neighbours()) == []
 
 
@@ -256,7 +256,7 @@ def test_nothing_is_a_neighbour_across_a_clock_that_goes_back() -> None:
     times_s = dict(zip("abcdef", [0.0, 1.0, 2.0, 0.5, 1.5, 2.5], strict=True))
     with pytest.warns(UserWarning, match="here: the clock goes back from frame 'c' to 'd'"):
         parts = parts_of_clock("abcdef", times_s, "here")
-    drive, wanted = Drive(np.arange(6.0)[:, None] * [1, 0, 0], parts), Neighbours(step_m=1.0, count=9)
+    drive, wanted = Drive(range(6), np.arange(6.0)[:, None] * [1, 0, 0], parts), Neighbours(step_m=1.0, count=9)
     assert drive.neighbours(2, wanted) == [1, 0] and drive.neighbours(4, wanted) == [3, 5]
 
 

@@ -70,7 +70,9 @@ def no_numpy_warnings() -> Iterator[None]:
     with warnings.catch_warnings(), np.errstate(over="raise", divide="raise", invalid="raise"):
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message="the target rig|views are|target cameras|size=")
-        warnings.filterwarnings("ignore", message="points: rows with NaN|camera .*: K: a focal length of")
+        warnings.filterwarnings(
+            "ignore", message="points: rows with NaN|camera .*: K: expected a focal length in pixels"
+        )
         yield
 
 

@@ -165,10 +165,10 @@ def test_lenses_and_road_of_a_sample_are_those_of_the_source(key: str) -> None:
 
 def test_calibration_without_the_images_leading_dimensions() -> None:
     images = torch.zeros((3, 2, 3, H, W), dtype=torch.uint8)
-    with pytest.raises(SampleError, match=r"K: expected shape \(2, 3, 3\) for 2 images, got \(3, 3\) in a frame of"):
+    with pytest.raises(SampleError, match=r"K: expected a tensor \(3,\) \+ \(n, ...\), .* got shape \(2, 3, 3\)"):
         read_frames(sample(images=images), None)
     wide = torch.zeros((2, 3, 2, 3, H, W), dtype=torch.uint8)
-    with pytest.raises(SampleError, match=r"K: expected shape \(2, 3, 3\) for 2 images, got \(3,\)"):
+    with pytest.raises(SampleError, match=r"cam2ego: expected a tensor \(2, 3\) \+ .*, got shape \(2, 4, 4\)"):
         read_frames(sample(images=wide), None)
 
 

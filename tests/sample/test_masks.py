@@ -65,7 +65,7 @@ def test_a_rim_is_warned_of_once_and_masked(monkeypatch: pytest.MonkeyPatch) -> 
     fish = fisheye()
     rig, image = Rig([fish]), vignetted(fish)[None]
     retarget = RigRetarget(Rig([camera("t", 0.0)]))
-    with pytest.warns(UserWarning, match=r"camera 'fish': the dark rim .* clean_masks=True"):
+    with pytest.warns(UserWarning, match=r"camera 'fish': image: .* dark rim .* clean_masks=True"):
         before = retarget({"images": image, "rig": rig})
     cleaned = cleaned_rig(rig, image)
     assert cleaned[0].mask is not None and cleaned_rig(cleaned, image)[0] is cleaned[0]

@@ -25,8 +25,7 @@ from arbiview_aug.cameras.rotations import (
 )
 from arbiview_aug.cameras.validation import doubts
 from arbiview_aug.datasets import FrameFolder, cleaned_rig, open_data
-from arbiview_aug.sample.label_mistakes import road_height_m
-from arbiview_aug.sample.mistakes import check_rig
+from arbiview_aug.sample.mistakes import check_rig, road_height_m
 from tests.helpers import street_sample
 
 Sample = dict[str, Any]
@@ -454,7 +453,7 @@ SAID = {  # of rendering: by an error over the street, else by a warning
     "ROS axes": "ROS.*multiply cam2ego",
     "inverted cam2ego": r"ego2cam, the inverse: pass np\.linalg\.inv",
     "K in millimetres": "camera 'front': K: .*millimetres",
-    "gt_boxes": "gt_boxes.*did you mean 'boxes_3d'",
+    "gt_boxes": "gt_boxes: .*did you mean boxes_3d",
 }
 
 
