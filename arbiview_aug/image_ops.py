@@ -111,24 +111,6 @@ def bounding_box(flags: npt.NDArray[np.bool_], margin_px: int = 0) -> tuple[slic
 _PAGES = 1 << 16  # smaller arrays come from memory that the process has
 
 
-class Scratch:
-    """Image buffers reused from call to call, one set per thread: allocating them costs more than filling them."""
-
-    def __init__(self) -> None:
-        self._local = threading.local()
-
-    def get(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
-        """Return a buffer of a shape and type in reused memory; its content is arbitrary but finite."""
-        buffers, size = self._local.__dict__, math.prod(shape)
-        buffer = buffers.get(name)
-        if buffer is None or buffer.size < size or buffer.dtype != dtype:
-            buffers[name] = buffer = np.zeros(size, dtype)
-        return buffer[:size].reshape(shape)
-
-    def __reduce__(self) -> tuple[type[Scratch], tuple[()]]:
-        return Scratch, ()
-
-
 class Memory:
     """Memory for arrays, reused once nothing refers to them: page faults are slow. It keeps ``limit`` bytes."""
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug import PlanCache, RandomRig, RigRetarget, SampleKeys, load_rig, project_boxes_3d
+from arbiview_aug import RandomRig, RigRetarget, SampleKeys, load_rig, project_boxes_3d
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder, Neighbours, NuScenesDataset
 from arbiview_aug.datasets.synthetic import SyntheticDrive
@@ -36,7 +36,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "mean": {"holes": "mean"},
     "draft": {"quality": "draft"},
     "accurate": {"quality": "accurate", "geometry": "street", "keys": SampleKeys(extra=ALL)},
-    "held refinement": {"quality": "accurate", "geometry": "street", "cache": PlanCache(share_overlap=True)},
     "paper": {"quality": "paper", "keys": SampleKeys(extra=("source_camera",))},
     "infinity": {"geometry": "infinity"},
     "ground": {"geometry": "ground"},

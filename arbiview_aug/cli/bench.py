@@ -1,7 +1,7 @@
 """``python -m arbiview_aug bench``: speed against accuracy of all settings, on the user's data.
 
-Sweeps quality, geometry, decoded size and cached depth from overlap, and marks the Pareto front. A note says where
-static surfaces should not be chosen, since cameras move: PSNR does not show what a detector learns from them.
+Sweeps quality, geometry and decoded size, and marks the Pareto front. A note says where static surfaces should not be
+chosen, since cameras move: PSNR does not show what a detector learns from them.
 
 Times are CPU time of a ``RigRetarget`` call on one thread, with the plan where every frame needs its own. Accuracy is
 the mean PSNR of pixels that some source sees, in the colours of images decoded at 1 / ``REFERENCE``: against LiDAR
@@ -26,7 +26,6 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from tqdm import tqdm
 
-from arbiview_aug import PlanCache
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import REAL_TARGET, writable_folder
@@ -62,12 +61,10 @@ class Setting(NamedTuple):
     quality: Quality
     surface: GeometryName
     reduce: Reduce  # images are decoded at 1 / this
-    cached: bool = False  # whether depth from overlap is cached
 
     @property
     def name(self) -> str:
-        depth = ["depth held"] if self.cached else []
-        return ", ".join([self.quality, self.surface, *depth, f"1/{self.reduce}"])
+        return f"{self.quality}, {self.surface}, 1/{self.reduce}"
 
 
 def settings(
@@ -80,8 +77,7 @@ def settings(
     for quality, reduce in itertools.product(qualities, reduces):
         for surface in surfaces if quality != "paper" else ("infinity",):
             if quality != "accurate" or _is_refined(surface):
-                caches = (False, True) if quality == "accurate" and GEOMETRIES[surface].overlap_depth else (False,)
-                rows += [Setting(quality, surface, reduce, cached) for cached in caches]
+                rows.append(Setting(quality, surface, reduce))
     return rows
 
 
@@ -146,8 +142,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         raise DataError(f"--geometry {' '.join(arguments.geometry or ['none'])}: expected geometry of {expected}")
     prefix, rows, calls = "even" if by_points else "true", [], dict[str, Callable[[], Any]]()
     for setting in tqdm(chosen, desc="accuracy", unit="setting", leave=False):
-        plans = PlanCache(share_overlap=setting.cached, max_bytes=0)  # the last plan alone
-        method = retargeting(setting.quality, setting.surface, cache=plans)
+        method = retargeting(setting.quality, setting.surface)
         frames = [frame for index in range(num_frames) for frame in scored(index, setting.reduce)]
         means = mean_of(
             row for frame in frames for row in scores(frame, method.render, frame.target or target, ("even",))[1]
@@ -159,7 +154,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         row: dict[str, Any] = {"name": setting.name, **setting._asdict(), "seen": means["seen"]}
         row |= {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
         rows.append(row | {"harm": static_harm(source, target, setting.surface, RenderConfig())})
-        retarget = RigRetarget(target, quality=setting.quality, geometry=setting.surface, holes="black", cache=plans)
+        options: dict[str, Any] = {"quality": setting.quality, "geometry": setting.surface, "holes": "black"}
+        retarget = RigRetarget(target, cache_bytes=0, **options)  # keeps the last plan alone
         calls[setting.name] = partial(retarget, frames[0].lidar["even"].sample if by_points else first)
     for reduce in reduces:
         data = open_data(arguments.data, reduce=reduce, load_points=False)

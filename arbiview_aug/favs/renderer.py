@@ -27,6 +27,7 @@ from arbiview_aug.favs.stage2_features import normalised, optimise_transformatio
 from arbiview_aug.favs.stage3_objects import align_objects, find_objects
 from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
 from arbiview_aug.render.harmonise import Harmoniser
+from arbiview_aug.render.plan import HoleContents
 from arbiview_aug.render.rendered import Views, from_winners
 from arbiview_aug.render.requirements import SAME_CENTER_M
 
@@ -229,5 +230,5 @@ def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> Vie
     views = rendering.targets
     winners, labels = [torch.from_numpy(view.source_camera) for view in views], partial(paper_labels, rendering)
     rendered = from_winners([view.image for view in views], rendering.target, winners, labels, outputs)
-    layers = [view.occluded if view.occluded is None else view.occluded.view(np.uint8) for view in views]
-    return replace(rendered, layers=layers, paint=[None] * len(views))
+    occluded = [None if view.occluded is None else view.occluded.view(np.uint8) for view in views]
+    return replace(rendered, holes=list(map(HoleContents, occluded)))

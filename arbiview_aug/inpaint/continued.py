@@ -21,7 +21,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.inpaint.inpainter import GREY, Inpainter
-from arbiview_aug.render.plan import Paint
+from arbiview_aug.render.plan import HoleContents, Paint
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.scene.boxes import PARTS
@@ -87,12 +87,11 @@ def fill_holes(frame: Views, only_mean: bool = False) -> list[torch.Tensor]:
     seen = [mask.cpu().numpy() for mask in frame.coverage]
     if all(mask.all() for mask in seen):
         return list(frame.images)
-    arrays, none = [_as_array(view) for view in frame.images], [None] * len(seen)
+    arrays, holes = [_as_array(view) for view in frame.images], frame.holes or [HoleContents()] * len(seen)
     needs_mean = only_mean or not all(mask.any() for mask in seen)
     mean = mean_colour(arrays, seen) if needs_mean else np.zeros(3, np.float32)
-    colours = None if only_mean else object_colours(arrays, frame.paint or none)
-    plans = zip(frame.layers or none, frame.paint or none, frame.road or none, frame.rig, strict=True)
-    for view, known, (layer, objects, on_road, camera) in zip(arrays, seen, plans, strict=True):
+    colours = None if only_mean else object_colours(arrays, [contents.paint for contents in holes])
+    for view, known, (layer, objects, on_road), camera in zip(arrays, seen, holes, frame.rig, strict=True):
         if known.all():
             continue
         rounding = 0.5 if view.dtype == np.uint8 else 0.0

@@ -38,7 +38,7 @@ class Inpainter:
         outcome: End of the warning "The rest is ...".
         is_random: Whether ``inpaint`` reads its seeds.
         needs_confidence: Whether frames must bring their confidence.
-        needs_layers: Whether frames must bring the layers of their holes (``Views.layers``).
+        needs_layers: Whether frames must bring what is in their holes (``Views.holes``).
         fills_own_car: Whether ``inpaint`` gets the own car, which is black, as a hole too, so that it does not bleed.
     """
 

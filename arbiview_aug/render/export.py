@@ -56,18 +56,13 @@ def export_plan(plan: RenderPlan, path: str | Path) -> None:
 
 
 def _view_arrays(view: ViewPlan) -> dict[str, Any]:
-    size = view.source_camera.shape
-    first, second = view.at.to_float(), np.full((*size, 2), -16, np.float32)
-    weight, second_source = np.zeros(size, np.float32), np.full(size, -1, np.int8)
-    is_linear = np.full(size, view.interpolation == "linear")
-    for band in view.bands:
-        h, w = band.weight.shape
-        place = slice(band.y, band.y + h), slice(band.x, band.x + w)
-        reads = band.weight > 0
-        second[place][reads], weight[place][reads] = band.at.to_float()[reads], band.weight[reads]
-        second_source[place][reads] = band.source
+    (h, w), first, seam = view.source_camera.shape, view.at.to_float(), view.seam
+    second, weight = np.full((h, w, 2), -16, np.float32), np.zeros((h, w), np.float32)
+    second_source, is_linear = np.full((h, w), -1, np.int8), np.full((h, w), view.interpolation == "linear")
+    second.reshape(-1, 2)[seam.pixel] = seam.at.to_float()[0]
+    weight.flat[seam.pixel], second_source.flat[seam.pixel] = seam.weight, seam.source
     if view.edge is not None:
-        is_linear.reshape(-1)[view.edge] = True
+        is_linear.flat[view.edge] = True
     return {
         "map_x": first[..., 0],
         "map_y": first[..., 1],

@@ -93,14 +93,11 @@ _MIN_LOG_GAIN = 0.005
 
 @dataclass(frozen=True)
 class PhotometricReport:
-    """The gains of a frame, and why; ``str`` prints them."""
+    """The gains of a frame, and why."""
 
     gains: tuple[float, ...]  # one for each source camera, median 1 before clipping; all 1 if they were declined
     accepted: bool  # whether the images are changed
     reason: str  # why, or why not
-
-    def __str__(self) -> str:
-        return self.of_cameras(map(str, range(len(self.gains))))
 
     def of_cameras(self, names: Iterable[str]) -> str:
         """The gains with the names of their cameras."""
@@ -169,8 +166,6 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
 
     ``overlaps`` are ``find_overlaps(rig)``, if known: finding them takes longer than the rest. Declined gains are 1.
     """
-    from arbiview_aug.render.photometry_kernels import overlap_errors
-
     overlaps = find_overlaps(rig) if overlaps is None else overlaps
     none = (1.0,) * len(rig)
     if not overlaps.pairs.size:
@@ -188,13 +183,23 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
     log_gains = np.clip(_solve(len(rig), overlaps.pairs[:, enough], ratio, variance), -limit, limit)
     if np.abs(log_gains).max() < _MIN_LOG_GAIN:
         return PhotometricReport(none, False, "the cameras agree already")
-    gains, errors = np.exp(log_gains), np.empty((2, count))
-    overlap_errors(pixels, held_out, overlaps.pairs, tone_curves(gains).astype(np.float32), errors)
-    before, after = (-10 * np.log10(np.maximum(errors, 1e-10))).mean(1).tolist()
+    gains, held = np.exp(log_gains), pixels[:, held_out[0] :]
+    curves = tone_curves(gains[overlaps.pairs]).repeat(np.diff(held_out), 1)[..., None]
+    gain, slope = np.moveaxis(curves, 2, 0)  # (2, n, 1)
+    lower, upper = held * gain, held * slope + (1 - slope)
+    toned = np.where(gain > 1, np.minimum(lower, upper), np.maximum(lower, upper))
+    before, after = (_overlap_psnr_db(both, held_out) for both in (held, toned))
     reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
         return PhotometricReport(none, False, f"gains would not help, {reason}")
     return PhotometricReport(tuple(gains[np.argsort(overlaps.order)].tolist()), True, reason)
+
+
+def _overlap_psnr_db(pixels: npt.NDArray[np.floating], ends: npt.NDArray[np.int64]) -> float:
+    """PSNR between both readings (2, n, 3) in [0, 1], mean over the groups."""
+    errors = ((pixels[0].astype(np.float64) - pixels[1]) ** 2).mean(1)
+    means = np.add.reduceat(errors, ends[:-1] - ends[0]) / np.diff(ends)
+    return float(-10 * np.log10(np.maximum(means, 1e-10)).mean())
 
 
 def _read(images: Sequence[torch.Tensor], shared: SharedPixels) -> _Pixels:
@@ -319,7 +324,7 @@ class Harmoniser:
         Estimated gains leave the source that wins most pixels of a view unchanged.
         """
         views = plan.targets
-        if self.estimates and all(len(view.pairs) + len(view.bands) < 2 for view in views):
+        if self.estimates and all(len(view.sources) < 2 for view in views):
             return None
         gains = self.report(rig, images).gains
         if all(gain == 1 for gain in gains):

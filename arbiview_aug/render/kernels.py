@@ -1,4 +1,4 @@
-"""Compiled loops over the pixels of a view: where each source sees them, which source wins, and bands along seams.
+"""Compiled loops over the pixels of a view: where each source sees them, and which source wins.
 
 ``plan_pixels`` evaluates all pixels: by rows where one source has weight, else in small blocks, of which the best two
 sources are kept. Sources without weight fill what those do not see. ``node_kernels`` has the weights.
@@ -16,7 +16,7 @@ import numpy as np
 
 from arbiview_aug.cameras.kernels import FAR_AWAY_PX, project_row, rays_row, turn_row
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
-from arbiview_aug.environment import borrowing, compiled, inlined
+from arbiview_aug.environment import borrowing, inlined
 from arbiview_aug.render.node_kernels import array_at
 from arbiview_aug.render.plan import GRID_STEP_PX, OUTSIDE
 from arbiview_aug.render.structures import Nodes, Occluders, Pixels, Sources, Surfaces, View
@@ -131,12 +131,12 @@ def _hide(
     else:
         for i in range(n):
             hides[i] = beyond[np.uint32(place[i])]
-    if occluders.is_guess:
-        for i in range(0 if has_faces else n):
-            limit[i] = _ZERO
-        for i in range(n if has_faces else 0):
+    if occluders.is_guess and not has_faces:
+        limit[:] = _ZERO
+    elif occluders.is_guess:
+        for i in range(n):
             z[i] = limit[i] if face[i] >= 0 else _ZERO
-        for i in range(n if has_faces else 0):
+        for i in range(n):
             limit[i] = z[i]
     for i in range(n if has_faces else 0):
         number = face[i]
@@ -275,8 +275,7 @@ def _plan_block(
                 to_face[x] = face[x]
             for x in range(n):
                 face_most = max(face_most, to_face[x])
-    for x in range(total if in_image else 0):
-        block.held[x] = 0
+    block.held[:] = 0
     several, is_first = some & (some - 1) != 0, True
     for k in range(sources.A.shape[0]):
         if not _is_in(some, k):
@@ -288,14 +287,10 @@ def _plan_block(
                 _weigh_row(weights[k], view.step, y, x0, mixed[(y - y0) * n : (y - y0) * n + n])
         if is_first:
             is_first = False
-            for x in range(total if several else 0):
-                weight_1[x] = mixed[x] if tag_1[x] >= 0 else -_ONE
-            for x in range(total if several else 0):
-                weight_2[x] = _ZERO
-            for x in range(total if several else 0):
-                xy_2[x] = _OUTSIDE
-            for x in range(total if several else 0):
-                tag_2[x] = np.int32(-1)
+            if several:
+                for x in range(total):
+                    weight_1[x] = mixed[x] if tag_1[x] >= 0 else -_ONE
+                weight_2[:], xy_2[:], tag_2[:] = _ZERO, _OUTSIDE, -1
         else:
             for x in range(total):
                 weight[x] = mixed[x] if tag[x] >= 0 else -_ONE - _ONE
@@ -354,23 +349,15 @@ def _plan_block(
             image = pixels.in_image[y, x0:x1]
             for x in range(n):
                 image[x] = np.uint8(from_held[x])
-    if several and pixels.second.shape[0]:
-        for x in range(total):
+    for y in range(y0, y1 if several and pixels.second.shape[0] else y0):
+        ahead = y * pixels.winner.shape[1] + x0 - (y - y0) * n
+        for x in range((y - y0) * n, (y - y0) * n + n):
             value = weight_2[x] / max(weight_1[x] + weight_2[x], _TINY)
-            weight[x] = value if (tag_2[x] >= 0) & (value >= LEAST_SHARE) else _ZERO
-        for y in range(y0, y1):
-            part = slice((y - y0) * n, (y - y0) * n + n)
-            from_xy, from_tag, from_share = xy_2[part], tag_2[part], weight[part]
-            second, share = pixels.second[y, x0:x1], pixels.share[y, x0:x1]
-            to_xy, frac = pixels.second_xy[y, x0:x1], pixels.second_frac[y, x0:x1]
-            for x in range(n):
-                share[x] = from_share[x]
-            for x in range(n):
-                second[x] = np.int8(from_tag[x] >> 16 if from_share[x] > _ZERO else np.int32(-1))
-            for x in range(n):
-                to_xy[x] = from_xy[x]
-            for x in range(n):
-                frac[x] = np.uint16(from_tag[x] & 1023)
+            if tag_2[x] >= 0 and value >= LEAST_SHARE:
+                at = pixels.count[0]
+                pixels.pixel[at], pixels.second[at] = ahead + x, tag_2[x] >> 16
+                pixels.second_xy[at], pixels.second_frac[at], pixels.share[at] = xy_2[x], tag_2[x] & 1023, value
+                pixels.count[0] = at + 1
     return unseen
 
 
@@ -412,7 +399,6 @@ def plan_pixels(
             if wanted.shape[0] and not wanted[j, i]:
                 strong[i], others[i] = 0, 0
             others[i] &= ~strong[i]
-            pixels.shared[j, i] = strong[i] & (strong[i] - 1) != 0
             if strong[i] == 0:
                 unseen += 1
                 for y in range(y0, y1):
@@ -433,7 +419,7 @@ def plan_pixels(
                     others[c] = every & ~strong[c]
                 others[c] = others[c] if has_hole else 0
             while i < nx - 1 and (fills == 0 or unseen > 0):
-                some, end, in_blocks = todo[i], i + 1, fills == 1 or pixels.shared[j, i]
+                some, end, in_blocks = todo[i], i + 1, fills == 1 or todo[i] & (todo[i] - 1) != 0
                 most = i + max(BLOCK_PX // step, 1) if in_blocks else nx - 1
                 while end < min(most, nx - 1) and todo[end] == some:
                     end += 1
@@ -446,66 +432,3 @@ def plan_pixels(
                             min(y + rows, y1), x0, x1, some, fills == 1,
                         )  # fmt: skip
                 i = end
-
-
-@compiled
-def find_bands(pixels: Pixels, step: int, strip: int, sources: Any, bands: Any) -> int:
-    """Find the rectangles that each second source adds to, and return their number.
-
-    Args:
-        pixels: The plan of a view.
-        step: Side of a cell, pixels.
-        strip: Height of a strip, pixels: slanted seams make narrow rectangles.
-        sources: (S,) sources in content order.
-        bands: (n, 5) int64, written: source, first and last (exclusive) row, first and last (exclusive) column.
-    """
-    (h, w), nx = pixels.second.shape, pixels.shared.shape[1]
-    rows = np.empty((128, (h + strip - 1) // strip, nx, 2), np.int32)  # first and last of each column of cells
-    for k in sources:
-        rows[k, ..., 0] = h
-        rows[k, ..., 1] = 0
-    for y in range(h):
-        for i in range(nx):
-            second, last = pixels.second[y, i * step : min(i * step + step, w)], np.int8(-1)
-            for x in range(second.shape[0] if pixels.shared[y // step, i] else 0):
-                if second[x] >= 0 and second[x] != last:
-                    last = second[x]
-                    ends = rows[last, y // strip, i]
-                    ends[0], ends[1] = min(ends[0], y), max(ends[1], y + 1)
-    count = 0
-    for k in sources:
-        for s in range(rows.shape[1]):
-            for i in range(nx):
-                y0, y1 = rows[k, s, i, 0], rows[k, s, i, 1]
-                if y1 == 0:
-                    continue
-                band = bands[count - 1]
-                if count and band[0] == k and band[1] // strip == s and band[4] == i * step:
-                    band[1], band[2], band[4] = min(band[1], y0), max(band[2], y1), min((i + 1) * step, w)
-                else:
-                    band = bands[count]
-                    band[0], band[1], band[2], band[3], band[4] = k, y0, y1, i * step, min((i + 1) * step, w)
-                    count += 1
-    return count
-
-
-@compiled
-def cut_bands(pixels: Pixels, bands: Any, band_xy: Any, band_frac: Any, weight: Any) -> None:
-    """Copy the positions and shares in rectangles (n, 5), one after the other; others than its source's read nothing.
-
-    ``band_xy``, ``band_frac`` and ``weight`` (all their pixels,) are written.
-    """
-    at = 0
-    for k in range(bands.shape[0]):
-        source, x0, x1 = np.int8(bands[k, 0]), bands[k, 3], bands[k, 4]
-        for y in range(bands[k, 1], bands[k, 2]):
-            part, second = slice(at, at + x1 - x0), pixels.second[y, x0:x1]
-            share, xy, frac = pixels.share[y, x0:x1], pixels.second_xy[y, x0:x1], pixels.second_frac[y, x0:x1]
-            out, out_xy, out_frac = weight[part], band_xy[part], band_frac[part]
-            for x in range(out.shape[0]):
-                out[x] = share[x] if second[x] == source else _ZERO
-            for x in range(out.shape[0]):
-                out_xy[x] = xy[x] if out[x] > _ZERO else _OUTSIDE
-            for x in range(out.shape[0]):
-                out_frac[x] = frac[x] if out[x] > _ZERO else np.uint16(0)
-            at += x1 - x0

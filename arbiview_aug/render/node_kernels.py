@@ -1,4 +1,4 @@
-"""Compiled loops over the nodes of a view: weights of the sources on them, which source wins them, and soft seams."""
+"""Compiled loops over the nodes of a view: weights of the sources on them, and which source wins them."""
 
 from __future__ import annotations
 
@@ -210,36 +210,3 @@ def win_nodes(view: View, nodes: Nodes, boxes: Any, winner: Any) -> None:
         for j in range(around if one >= 0 else 0):
             if score[one, near[j]] > _ZERO:
                 chosen[near[j]] = one
-
-
-@compiled
-def soften(winner: Any, border_px: Any, radius: int, width_px: float, weights: Any) -> None:
-    """Write ``weights.seam_weights`` (K, ny, nx) float32, by the borders (K, ny, nx) of what the sources see."""
-    K, ny, nx = border_px.shape
-    side, width = 2 * radius + 1, np.float32(width_px)
-    row, across, total = np.empty(nx + 2 * radius, np.float32), np.empty((ny, nx)), np.empty(nx)
-    for k in range(K):
-        soft = weights[k]
-        for j in range(ny):
-            for i in range(nx):
-                soft[j, i] = _ONE if winner[j, i] == k else _ZERO
-        for _ in range(2):  # two passes of a box make a smooth ramp
-            for j in range(ny):
-                for i in range(row.shape[0]):
-                    row[i] = soft[j, min(max(i - radius, 0), nx - 1)]
-                across[j] = 0.0
-                for shift in range(side):
-                    part = row[shift : shift + nx]
-                    for i in range(nx):
-                        across[j, i] += part[i]
-            for j in range(ny):
-                total[:] = 0.0
-                for shift in range(side):
-                    part = across[min(max(j + shift - radius, 0), ny - 1)]
-                    for i in range(nx):
-                        total[i] += part[i]
-                for i in range(nx):
-                    soft[j, i] = total[i] * (1.0 / (side * side))
-        for j in range(ny):
-            for i in range(nx):
-                soft[j, i] *= min(max(border_px[k, j, i] / width, _ZERO), _ONE)

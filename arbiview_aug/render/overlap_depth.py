@@ -35,11 +35,8 @@ from arbiview_aug.cameras.rays import (
     project_rays,
 )
 from arbiview_aug.cameras.rig import Rig, content_order
-from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import at_level, level_size, write_halved
-from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import MIN_PIXELS
-from arbiview_aug.sample.frame import Frame
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.surface import Correction, Layer, StaticSurface, Street
 
@@ -149,11 +146,6 @@ class OverlapDepth:
 
     corrections: tuple[Correction, ...]  # one for each accepted pair
     reports: tuple[OverlapReport, ...]  # one for each pair of neighbours, in the order of their names
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes."""
-        return sum(correction.nbytes for correction in self.corrections)
 
     def __str__(self) -> str:
         if not self.reports:
@@ -364,37 +356,3 @@ def reduced(image: torch.Tensor, level: int) -> Layer:
         small = np.empty((*size, 3), np.uint8 if image.dtype == torch.uint8 else np.float32)
         write_halved(image, level, small)
     return np.multiply(small, 1 / top, dtype=np.float32)
-
-
-# --- as a stage of the transform --------------------------------------------------------------------------------------
-_OVERLAP_BYTES = 128 * 2**20  # about 4 MB each for six cameras
-
-OverlapCache = LRUCache[tuple[bytes, str | None], OverlapDepth]
-"""Depth from overlap by calibration, with the names that reports show, and by the name that frames share."""
-
-
-def overlap_cache(share: bool | str, config: Any) -> OverlapCache | None:
-    """The cache of ``PlanCache.share_overlap``; ValueError unless the config enables depth from overlap."""
-    if share is False:
-        return None
-    if not getattr(config, "overlap_depth", False):
-        raise ValueError("PlanCache.share_overlap: expected quality='accurate' (or overlap_depth=True) with it")
-    return LRUCache(_OVERLAP_BYTES, attrgetter("nbytes"))
-
-
-def estimate_overlap(
-    frame: Frame, boxes: FloatArray | None, share: bool | str, shared: OverlapCache | None
-) -> OverlapDepth:
-    """Estimate depth from the overlaps of a frame's images without objects (B, 7), or take it from a cache.
-
-    Raises:
-        SampleError: The sample lacks the key ``share`` by which the cache shares depth.
-    """
-    if shared is None:
-        return overlap_depth(frame.rig, frame.images, boxes)
-    name = frame.further.get(share) if isinstance(share, str) else None
-    if isinstance(share, str) and name is None:
-        raise SampleError(
-            f"PlanCache.share_overlap: expected {share!r} in the sample, which tells frames that share depth"
-        )
-    return shared.get((frame.rig.named_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))

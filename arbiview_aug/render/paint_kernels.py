@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.environment import borrowing, compiled
+from arbiview_aug.environment import borrowing, called, compiled
 from arbiview_aug.render.plan import NEARER, Paint, nearer_cells
 from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
 
@@ -234,26 +234,13 @@ def nearest_seen(face: Any, part: Any, winner: Any, pixel: Any, starts: Any, nea
                 above[x] = k
 
 
-@borrowing
+@called
 def _select(values: Any, n: int, share: float) -> Any:
-    """A quantile of the first n values, not interpolated; they are reordered (Hoare's selection)."""
-    low, high, k = 0, n - 1, int(share * n)
-    while low < high:
-        pivot, i, j = values[(low + high) // 2], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        low, high = (low, j) if k <= j else (i, high) if k >= i else (k, k)
-    return values[k]
+    """A quantile of the first n values, not interpolated."""
+    return np.partition(values[:n], int(share * n))[int(share * n)]
 
 
-@borrowing
+@called
 def _quantile(samples: Any, first: int, end: int, share: float, bright: float, values: Any, colour: Any) -> bool:
     """Write a quantile of each channel of some samples (3, n), or of the brightest ones; False for too few of them.
 

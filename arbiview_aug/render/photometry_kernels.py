@@ -1,4 +1,4 @@
-"""Compiled loops of rendering: reading ahead, readings of shared pixels, tone curves, and blended seams."""
+"""Compiled loops of rendering: reading ahead, readings of shared pixels, tone curves, and blending along seams."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.environment import borrowing, compiled
+from arbiview_aug.environment import compiled, inlined
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _MOST_SIDE_PX = 32767
@@ -86,69 +86,6 @@ def log_ratios(pixels: Any, ends: Any, dark: float, bright: float, measured: Any
 
 
 @compiled
-def sample_band(
-    weight: Any, y0: int, x0: int, step: int, xy: Any, band_xy: Any, slots: Any, rank: Any, parts: Any, rows: int,
-    keys: Any, source: Any, at: Any, count: int,
-) -> int:  # fmt: skip
-    """Sample the pixels of a blended band that two sources show; return the new number of samples.
-
-    ``weight`` (h, w) of the band at (``y0``, ``x0``) counts where it is not 0. ``xy`` (H, W, 2) and ``band_xy`` (h, w,
-    2) are places in the atlas of the view and of the band, ``slots`` (S, 6) the sources' x, y, width, height, number
-    and halvings there, ``rank`` (N,) their places in the view, those that win more pixels first, and ``parts`` (H,)
-    the part of the height, of ``rows``, of each row, more by what tells views apart.
-
-    Written from ``count`` on: ``source`` (2, n), the better and the worse one; ``at`` (2, n, 2), row and column in
-    each; ``keys`` (n,), what sorts samples by view, rank and number of the worse source, the better one, and part.
-    """
-    most = len(rank) + 1
-    for y in range(0, weight.shape[0], step):
-        for x in range(0, weight.shape[1], step):
-            if weight[y, x] == _ZERO:
-                continue
-            for side in range(2):
-                place = band_xy[y, x] if side else xy[y + y0, x + x0]
-                source[side, count] = -1
-                for s in range(slots.shape[0]):
-                    column, row = place[0] - slots[s, 0], place[1] - slots[s, 1]
-                    if 0 <= column < slots[s, 2] and 0 <= row < slots[s, 3]:
-                        source[side, count], level = slots[s, 4], slots[s, 5]
-                        at[side, count, 0] = (row << level) + (1 << level) // 2
-                        at[side, count, 1] = (column << level) + (1 << level) // 2
-            one, two = source[0, count], source[1, count]
-            if one < 0 or two < 0:
-                continue
-            if rank[two] < rank[one]:
-                source[0, count], source[1, count] = two, one
-                for k in range(2):
-                    at[0, count, k], at[1, count, k] = at[1, count, k], at[0, count, k]
-            other = source[1, count]
-            keys[count] = ((rank[other] * most + other) * most + source[0, count]) * rows + parts[y + y0]
-            count += 1
-    return count
-
-
-@compiled
-def overlap_errors(pixels: Any, ends: Any, pairs: Any, curves: Any, errors: Any) -> None:
-    """Mean squared differences of both readings of each group's pixels, before and after tone curves.
-
-    ``pixels`` and ``ends`` as in ``log_ratios``; ``pairs`` (2, G) are both cameras, ``curves`` (N, 2) are the cameras',
-    and ``errors`` (2, G) are written.
-    """
-    both = np.empty((2, 3), np.float32)
-    for g in range(len(ends) - 1):
-        errors[:, g] = 0
-        for k in range(ends[g], ends[g + 1]):
-            for c in range(3):
-                errors[0, g] += (np.float64(pixels[0, k, c]) - np.float64(pixels[1, k, c])) ** 2
-            for side in range(2):
-                both[side] = pixels[side, k]
-                _tone(both[side], curves[pairs[side, g], 0], curves[pairs[side, g], 1], _ONE, _ZERO)
-            for c in range(3):
-                errors[1, g] += (np.float64(both[0, c]) - np.float64(both[1, c])) ** 2
-        errors[:, g] /= 3 * (ends[g + 1] - ends[g])
-
-
-@compiled
 def list_runs(values: Any, runs: Any) -> int:
     """List the runs of equal values in the rows of an image (h, w): row, first column, end, value; return their number.
 
@@ -175,6 +112,14 @@ def list_runs(values: Any, runs: Any) -> int:
     return count
 
 
+@inlined
+def _toned(value: Any, gain: Any, slope: Any, top: Any) -> Any:
+    """A value after a curve, as ``harmonise.tone_curves`` makes it."""
+    x = np.float32(value)
+    lower, upper = x * gain, x * slope + top * (_ONE - slope)
+    return min(lower, upper) if gain > _ONE else max(lower, upper)
+
+
 @compiled
 def tone(values: Any, runs: Any, curves: Any, top: Any, rounding: Any) -> None:
     """Put the pixels of a view (h, 3 w) of interleaved colours, uint8 or float32, through their sources' tone curves.
@@ -184,64 +129,44 @@ def tone(values: Any, runs: Any, curves: Any, top: Any, rounding: Any) -> None:
     """
     for r in range(len(runs)):
         y, first, end, source = runs[r, 0], runs[r, 1], runs[r, 2], runs[r, 3]
-        if source >= 0:
-            _tone(values[y, 3 * first : 3 * end], curves[source, y, 0], curves[source, y, 1], top, rounding)
+        if source >= 0 and curves[source, y, 0] != _ONE:
+            part, gain, slope = values[y, 3 * first : 3 * end], curves[source, y, 0], curves[source, y, 1]
+            for j in range(len(part)):
+                part[j] = _toned(part[j], gain, slope, top) + rounding
 
 
 @compiled
-def tone_band(values: Any, curves: Any, top: Any, rounding: Any) -> None:
-    """Put a band (h, 3 w) of one source through its curves (h, 2), as ``tone`` does."""
-    for y in range(len(values)):
-        _tone(values[y], curves[y, 0], curves[y, 1], top, rounding)
-
-
-@borrowing
-def _tone(part: Any, gain: Any, slope: Any, top: Any, rounding: Any) -> None:
-    """Put values (n,) through one curve."""
-    offset = top * (_ONE - slope)
-    if gain > _ONE:
-        for j in range(len(part)):
-            x = np.float32(part[j])
-            part[j] = min(x * gain, x * slope + offset) + rounding
-    elif gain != _ONE:
-        for j in range(len(part)):
-            x = np.float32(part[j])
-            part[j] = max(x * gain, x * slope + offset) + rounding
+def tone_pixels(values: Any, source: Any, row: Any, curves: Any, top: Any, rounding: Any) -> None:
+    """Put pixels (n, 3) of sources (n,) in rows (n,) of a view through their curves, as ``tone`` does."""
+    for k in range(len(values)):
+        gain, slope = curves[source[k], row[k], 0], curves[source[k], row[k], 1]
+        for c in range(3 if gain != _ONE else 0):
+            values[k, c] = _toned(values[k, c], gain, slope, top) + rounding
 
 
 @compiled
-def blend(first: Any, second: Any, weight: Any, rounding: Any) -> None:
-    """Blend images (h, 3 w) of interleaved colours, uint8 or float32, into the first one.
+def blend(view: Any, pixel: Any, second: Any, weight: Any, rounding: Any) -> None:
+    """Blend colours (n, 3) with shares (n,) float32 into pixels (n,) of a view (h w, 3), uint8 or float32.
 
-    ``weight`` (h, w) float32 is the share of the second; ``rounding`` is added before the fraction is cut off.
+    ``rounding`` is added before the fraction is cut off.
     """
-    (h, w), shares = weight.shape, np.empty(first.shape[1], np.float32)
-    for y in range(h):
-        one, two = first[y], second[y]
-        for x in range(w):
-            shares[3 * x] = shares[3 * x + 1] = shares[3 * x + 2] = weight[y, x]
-        for x in range(3 * w):
-            level = np.float32(one[x])
-            one[x] = level + (np.float32(two[x]) - level) * shares[x] + rounding
+    for k in range(len(pixel)):
+        at, share = pixel[k], weight[k]
+        for c in range(3):
+            level = np.float32(view[at, c])
+            view[at, c] = level + (np.float32(second[k, c]) - level) * share + rounding
 
 
 def warm_up() -> None:
     """Compile these kernels, or load them from numba's cache."""
-    source, at, ends = np.zeros((2, 1), np.int64), np.zeros((2, 1, 2), np.int64), np.array([0, 1])
-    pixels, curves, slots = (
-        np.ones((2, 1, 3), np.float32),
-        np.ones((1, 1, 2), np.float32),
-        np.array([[0, 0, 1, 1, 0, 0]]),
-    )
-    xy, weight, runs = np.zeros((1, 1, 2), np.int16), np.ones((1, 1), np.float32), np.zeros((1, 4), np.int32)
-    log_ratios(pixels, ends, 0.0, 2.0, np.empty((1, 3)))
-    overlap_errors(pixels, ends, source, curves[0], np.empty((2, 1)))
-    sample_band(weight, 0, 0, 1, xy, xy, slots, ends, ends, 1, ends, source, at, 0)
-    list_runs(np.zeros((1, 1), np.int8), runs)
+    source, at, number = np.zeros((2, 1), np.int64), np.zeros((2, 1, 2), np.int64), np.zeros(1, np.int64)
+    pixels, curves = np.ones((2, 1, 3), np.float32), np.ones((1, 1, 2), np.float32)
+    log_ratios(pixels, np.array([0, 1]), 0.0, 2.0, np.empty((1, 3)))
+    list_runs(np.zeros((1, 1), np.int8), np.zeros((1, 4), np.int32))
     for planes in (np.zeros((3, 1, 1), np.uint8), np.zeros((3, 1, 1), np.float32)):
         for image in (planes, planes.transpose(0, 2, 1)):  # channels first, and last
             read_pixels(image, 0, source, at, _ONE, pixels)
         view = planes.reshape(1, 3)
-        tone(view, runs, curves, _ONE, _ZERO)
-        tone_band(view, curves[0], _ONE, _ZERO)
-        blend(view, view, weight, _ZERO)
+        tone(view, np.zeros((1, 4), np.int32), curves, _ONE, _ZERO)
+        tone_pixels(view, number.astype(np.int8), number, curves, _ONE, _ZERO)
+        blend(view, number, view, curves[0, 0, :1], _ZERO)

@@ -1,7 +1,7 @@
 """The render plan: everything about a (source rig, target rig) pair but image content; and its settings.
 
 A plan is plain data: the place of each source image in an atlas, and for every target camera the position of every
-pixel in it, its winning source, and the bands along seams that are blended.
+pixel in it, its winning source, and the pixels along seams that are blended.
 
 Convention: a map holds, for every target pixel, the (x, y) of the atlas pixel to read; pixel centres are integers.
 Maps are OpenCV's fixed-point pairs: ``xy`` (h, w, 2) int16 whole pixels and ``frac`` (h, w) uint16 with 32nds of a
@@ -15,7 +15,7 @@ target that sees several sources.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -43,7 +43,7 @@ class RenderConfig:
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
         sky: Find sky in photographs where no scan line of LiDAR returned (``scene.sky``).
         certainty: Store the geometry's accuracy in plans, one byte a pixel, for ``SampleKeys(extra=("confidence",))``.
-        layers: Store holes' contents (``ViewPlan.layers``, ``paint``, ``road``); ``RigRetarget`` sets it by ``holes``.
+        layers: Store holes' contents (``ViewPlan.holes``); ``RigRetarget`` sets it by ``holes``.
     """
 
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
@@ -111,11 +111,6 @@ class FixedMap:
     def packed(self) -> npt.NDArray[np.int32]:
         """``xy`` as one number for each pixel, (h, w): y in the upper half, x in the lower; the same memory."""
         return self.xy.view(np.int32)[..., 0]
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes."""
-        return self.xy.nbytes + self.frac.nbytes
 
 
 @dataclass(frozen=True)
@@ -194,14 +189,13 @@ class SourceUse:
 
 
 @dataclass(frozen=True)
-class BlendRegion:
-    """A rectangle in which a second source is blended into the winning one."""
+class Seam:
+    """The n pixels of a view into which a second source is blended."""
 
-    y: int  # first row in the target
-    x: int  # first column
-    source: int  # index of the second source
-    at: FixedMap  # positions of the second source in the atlas
-    weight: npt.NDArray[np.float32]  # (h, w) share of the second source, at most 0.5
+    pixel: npt.NDArray[np.int64]  # (n,) into the flattened view
+    source: npt.NDArray[np.int8]  # (n,) index of the second source
+    at: FixedMap  # (1, n) position in the atlas, in the second source
+    weight: npt.NDArray[np.float32]  # (n,) share of the second source, at most 0.5
 
 
 BACKGROUND, OCCLUDED, OBJECT = range(3)
@@ -231,10 +225,20 @@ class Paint:
     sample_part: npt.NDArray[np.int32]  # (m,) int32 their parts
     nearest: npt.NDArray[np.int32]  # (4, n) int32 seen pixels next to the unseen ones, ``paint_kernels.nearest_seen``
 
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes."""
-        return 6 * self.pixel.nbytes + 2 * self.sample.nbytes
+
+class HoleContents(NamedTuple):
+    """Contents of a view's holes, for fillers.
+
+    Attributes:
+        layers: (h, w) uint8 layer of each pixel; None if all are ``BACKGROUND``.
+        paint: Unseen parts of objects; None without ``layers`` or objects.
+        road: (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the planner's nodes: one a
+            pixel in small views; None without holes, or where all is infinitely far away.
+    """
+
+    layers: npt.NDArray[np.uint8] | None = None
+    paint: Paint | None = None
+    road: BoolArray | None = None
 
 
 @dataclass(frozen=True)
@@ -243,7 +247,7 @@ class ViewPlan:
 
     at: FixedMap  # position of each pixel in the atlas, in its winning source
     source_camera: npt.NDArray[np.int8]  # (h, w) int8 index of the winning source, -1 where no source sees the pixel
-    bands: tuple[BlendRegion, ...]  # blended rectangles along the seams
+    seam: Seam  # pixels that are blended
     pairs: tuple[SourceUse, ...]  # one for each source that wins any pixel
     interpolation: str = "linear"  # ``nearest``, ``linear`` or ``cubic``
     # (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request
@@ -251,12 +255,7 @@ class ViewPlan:
     # (n,) int64 pixels of the flattened view, ascending, that are read bilinearly, since cubics would reach outside the
     # source or onto its mask; None unless the view is cubic
     edge: npt.NDArray[np.int64] | None = None
-    # (h, w) uint8 layer of each pixel, for fillers; None if all are ``BACKGROUND``
-    layers: npt.NDArray[np.uint8] | None = None
-    paint: Paint | None = None  # unseen parts of objects; None without ``layers`` or objects
-    # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the planner's nodes: one a pixel in
-    # small views; None without holes, or where all is infinitely far away
-    road: BoolArray | None = None
+    holes: HoleContents = HoleContents()  # noqa: RUF009 - immutable
     # (h, w) float32 inverse distances along the view's rays over measured or labelled geometry; None over others
     measured: npt.NDArray[np.float32] | None = None
 
@@ -268,11 +267,11 @@ class ViewPlan:
     @property
     def sources(self) -> set[int]:
         """Indices of the source cameras that are read."""
-        return {pair.source for pair in self.pairs} | {band.source for band in self.bands}
+        return {pair.source for pair in self.pairs} | set(np.unique(self.seam.source).tolist())
 
     @cached_property
     def seam_interpolation(self) -> str:
-        """Interpolation of the bands; never cubic: a mean of two sources is no sharper for it."""
+        """Interpolation of second sources; never cubic: a mean of two sources is no sharper for it."""
         return "linear" if self.interpolation == "cubic" else self.interpolation
 
     @cached_property
@@ -282,14 +281,6 @@ class ViewPlan:
 
         runs = np.empty((self.source_camera.size, 4), np.int32)
         return runs[: list_runs(self.source_camera, runs)].copy()
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes."""
-        bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
-        parts = self.certainty, self.edge, self.layers, self.paint, self.road, self.measured
-        further = sum(part.nbytes for part in parts if part is not None)
-        return self.at.nbytes + self.source_camera.nbytes + bands + further
 
 
 SEAM_ROWS = 16
@@ -318,6 +309,14 @@ class SeamSamples(NamedTuple):
     seams: list[list[int]]  # view, other source, first group and end; sources that win more come first
 
 
+def bytes_of(value: Any) -> int:
+    """Memory in bytes of the arrays and tensors in plain data."""
+    if hasattr(value, "nbytes"):
+        return int(value.nbytes)
+    parts = value if isinstance(value, tuple | list) else list(vars(value).values()) if is_dataclass(value) else ()
+    return sum(map(bytes_of, parts))
+
+
 @dataclass(frozen=True)
 class RenderPlan:
     """Everything needed to render a target rig from a source rig's images; plain data, picklable."""
@@ -336,34 +335,42 @@ class RenderPlan:
     @property
     def nbytes(self) -> int:
         """Memory of the maps in bytes, on devices too."""
-        on_devices = list(self.on_devices.values())
-        return sum(t.nbytes for t in self.targets) + sum(view.nbytes for views in on_devices for view in views)
+        return bytes_of((self.targets, list(self.on_devices.values())))
 
     @cached_property
     def seam_samples(self) -> SeamSamples:
-        """The blended bands as two sources show them."""
-        from arbiview_aug.render.photometry_kernels import sample_band
-
-        slots = np.array([[s.x, s.y, *s.size[::-1], s.source, s.level] for s in self.layout.slots], np.int64)
-        count, most = 0, sum(band.weight.size for view in self.targets for band in view.bands)
-        keys, source, at = (np.empty(shape, np.int64) for shape in (most, (2, most), (2, most, 2)))
-        shape = len(self.targets), *(len(self.source) + 1,) * 3, SEAM_ROWS  # view, rank, other and better source, part
-        for number, view in enumerate(self.targets):
-            step = max(1, view.source_camera.shape[1] // _SEAM_SAMPLES)
-            rank, h = np.full(len(self.source), len(self.source)), len(view.source_camera)
-            rank[[pair.source for pair in view.pairs]] = range(len(view.pairs))
-            parts = np.arange(h) * SEAM_ROWS // h + number * int(np.prod(shape[1:]))
-            for band in view.bands:
-                place = band.y, band.x, step, view.at.xy, band.at.xy
-                count = sample_band(band.weight, *place, slots, rank, parts, SEAM_ROWS, keys, source, at, count)
-        order = np.argsort(keys[:count], kind="stable")
+        """A sample of the blended pixels, as two sources show them."""
+        slots = np.array([(s.x, s.y, *s.size[::-1], s.source, s.level) for s in self.layout.slots])
+        first, source, level = slots[:, :2], slots[:, 4], slots[:, 5]
+        rank, samples = np.full((len(self.targets), len(self.source)), len(self.source)), []
+        for number, plan in enumerate(self.targets):
+            rank[number, [pair.source for pair in plan.pairs]] = range(len(plan.pairs))  # wins more: comes first
+            (h, w), sampled = plan.source_camera.shape, np.zeros(plan.source_camera.shape, bool)
+            sampled[:: max(1, w // _SEAM_SAMPLES), :: max(1, w // _SEAM_SAMPLES)] = True
+            k = np.flatnonzero(sampled.reshape(-1)[plan.seam.pixel])
+            pixel = plan.seam.pixel[k]
+            both = plan.at.xy.reshape(-1, 2)[pixel], plan.seam.at.xy[0, k]
+            samples.append(np.column_stack([np.full(len(k), number), pixel // w * SEAM_ROWS // h, *both]))
+        view, part, *xy = np.concatenate(samples).T
+        places = np.reshape(xy, (2, 2, -1)).transpose(0, 2, 1)  # (2, n, 2) in the atlas
+        within = ((places[:, :, None] >= first) & (places[:, :, None] < first + slots[:, 2:4])).all(-1)
+        known = within.any(-1).all(0)  # but rounded ones next to their slot
+        slot, view, part = within[:, known].argmax(-1), view[known], part[known]
+        halvings = level[slot][..., None]
+        at = (places[:, known] - first[slot] << halvings)[..., ::-1] + (1 << halvings) // 2
+        order = np.argsort(rank[view, source[slot]], axis=0, kind="stable")
+        better, other = cameras = np.take_along_axis(source[slot], order, 0)
+        at = np.take_along_axis(at, order[..., None], 0)
+        shape = len(self.targets), *(len(self.source) + 1,) * 3, SEAM_ROWS
+        keys = np.ravel_multi_index((view, rank[view, other], other, better, part), shape)
+        order = np.argsort(keys, kind="stable")
         keys = keys[order]
         starts = np.flatnonzero(np.diff(keys, prepend=-1))
         views, _, other, better, part = np.unravel_index(keys[starts], shape)
         changes = np.flatnonzero(np.diff(keys[starts] // (shape[3] * SEAM_ROWS), prepend=-1))
         ends = np.append(changes, len(starts))[1:]
         seams = np.column_stack([views[changes], other[changes], changes, ends]).tolist()
-        shared = SharedPixels(source[:, order], at[:, order], np.append(starts, count))
+        shared = SharedPixels(cameras[:, order], at[:, order], np.append(starts, len(keys)))
         return SeamSamples(shared, better, part, seams)
 
     @property

@@ -18,10 +18,10 @@ import torch
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.image_ops import Scratch, interleaved, nearest_resized, resized, write_halved
+from arbiview_aug.image_ops import FRESH, Memory, interleaved, nearest_resized, resized, write_halved
 from arbiview_aug.render.confidence import confidence
 from arbiview_aug.render.harmonise import LEVELS, SHARES, Curves
-from arbiview_aug.render.plan import AtlasLayout, FixedMap, Paint, RenderPlan
+from arbiview_aug.render.plan import AtlasLayout, FixedMap, HoleContents, RenderPlan
 from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.sample.batching import barred, covered, framed, stacked
 from arbiview_aug.sample.frame import Frame
@@ -34,29 +34,28 @@ _FLAGS = {"nearest": cv2.INTER_NEAREST, "linear": cv2.INTER_LINEAR, "cubic": cv2
 def render_opencv(
     plan: RenderPlan,
     images: Sequence[torch.Tensor],
-    scratch: Scratch | None = None,
     curves: Curves | None = None,
     seams: list[torch.Tensor] | None = None,
+    memory: Memory = FRESH,
 ) -> list[torch.Tensor]:
     """Render the target views of one frame with ``cv2.remap``; not differentiable.
 
     Args:
         plan: The plan for these images' rig.
         images: N images (3, H, W) on the CPU: uint8, or float in [0, 1].
-        scratch: Buffers to reuse between calls.
         curves: Tone curves of each view for the pixels of each image.
         seams: A list to append to, for each view, (h, w) float32: the change of the winner's colour by blending a
             second source, mean over the channels, in the images' unit.
+        memory: Memory to reuse between calls.
 
     Returns:
         M views (3, h, w) of the images' type, black where no source sees; slices of one block where sizes agree.
     """
-    from arbiview_aug.render.photometry_kernels import blend, read_ahead, tone, tone_band
+    from arbiview_aug.render.photometry_kernels import blend, read_ahead, tone, tone_pixels
 
-    scratch = scratch or Scratch()
     dtype = images[0].dtype
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
-    atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
+    atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], memory)
     rows_of_bytes = atlas.view(np.uint8).reshape(len(atlas), -1)
     sizes = [target.source_camera.shape for target in plan.targets]
     if len(set(sizes)) == 1:
@@ -64,62 +63,57 @@ def render_opencv(
     else:
         views = [torch.empty((3, *size), dtype=work) for size in sizes]
     scale = LEVELS if work == torch.uint8 else SHARES
-    pixels = scratch.get("view", (max(target.source_camera.size for target in plan.targets), 3), atlas.dtype)
+    pixels = memory.empty((max(target.source_camera.size for target in plan.targets), 3), atlas.dtype)
     for number, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
-        h, w = target.source_camera.shape
-        if curves is not None:
-            tones = curves[number].astype(np.float32)
-            tones = tones if tones.ndim == 3 else tones[:, None].repeat(h, 1)
-        change = np.zeros((h, w), np.float32) if seams is not None else None
+        (h, w), at, seam = target.source_camera.shape, target.at, target.seam
+        change = np.zeros(h * w if seams is not None else 0, np.float32)
         if seams is not None:
-            seams.append(torch.from_numpy(change))
+            seams.append(torch.from_numpy(change.reshape(h, w)))
         if not target.pairs:
             view.zero_()
             continue
-        buffer, at, winner = pixels[: h * w].reshape(h, w, 3), target.at, target.source_camera
+        flat = pixels[: h * w]
+        buffer = flat.reshape(h, w, 3)
         for y in range(0, h, _STRIP_ROWS):
             rows = slice(y, y + _STRIP_ROWS)
-            strip = buffer[rows]
-            read_ahead(rows_of_bytes, 3 * atlas.itemsize, at.packed[rows], winner[rows])
-            _remap(atlas, at.xy[rows], at.frac[rows], target.interpolation, dst=strip)
-            if target.edge is not None:
-                first, end = np.searchsorted(target.edge, (y * w, (y + _STRIP_ROWS) * w))
-                _put_edge(target.edge[first:end], at, atlas, buffer, rows)
+            read_ahead(rows_of_bytes, 3 * atlas.itemsize, at.packed[rows], target.source_camera[rows])
+            _remap(atlas, at.xy[rows], at.frac[rows], target.interpolation, dst=buffer[rows])
+        if target.edge is not None:
+            if work != torch.uint8:
+                np.clip(buffer, 0, 1, out=buffer)  # cubics overshoot
+            edge = FixedMap(at.xy.reshape(1, -1, 2)[:, target.edge], at.frac.reshape(1, -1)[:, target.edge])
+            flat[target.edge] = _read_pixels(atlas, edge, "linear")
+        second = _read_pixels(atlas, seam.at, target.seam_interpolation)
         # Tone the views, not the sources: these have more pixels, and would have to be copied.
         if curves is not None:
+            tones = curves[number].astype(np.float32)
+            tones = tones if tones.ndim == 3 else tones[:, None].repeat(h, 1)
             tone(buffer.reshape(h, -1), target.runs, tones, *scale)
-        for band in target.bands:
-            bh, bw = band.weight.shape
-            rows, columns = slice(band.y, band.y + bh), slice(band.x, band.x + bw)
-            second = _remap(atlas, band.at.xy, band.at.frac, target.seam_interpolation)
-            if curves is not None:
-                tone_band(second.reshape(bh, -1), tones[band.source, rows], *scale)
-            if change is not None:
-                difference = np.abs(buffer[rows, columns].astype(np.float32) - second).mean(-1)
-                change[rows, columns] += difference * band.weight
-            part = buffer.reshape(h, -1)[rows, 3 * columns.start : 3 * columns.stop]
-            blend(part, second.reshape(bh, -1), band.weight, scale[1])
+            tone_pixels(second, seam.source, seam.pixel // w, tones, *scale)
+        if seams is not None:
+            change[seam.pixel] = np.abs(flat[seam.pixel].astype(np.float32) - second).mean(-1) * seam.weight
+        blend(flat, seam.pixel, second, seam.weight, scale[1])
         cv2.split(buffer, list(view.numpy()))
     return [view.to(dtype) for view in views]
 
 
-def _put_edge(edge: np.ndarray, at: FixedMap, atlas: np.ndarray, view: np.ndarray, rows: slice) -> None:
-    """Read pixels of a view's rows bilinearly where cubics would reach too far, and clip overshoot of floats."""
-    if view.dtype != np.uint8:
-        np.clip(view[rows], 0, 1, out=view[rows])
-    flat, xy, frac = view.reshape(-1, 3), at.xy.reshape(-1, 2), at.frac.reshape(-1)
-    for first in range(0, len(edge), _REMAP_COLUMNS):
-        some = edge[first : first + _REMAP_COLUMNS]
-        flat[some] = _remap(atlas, xy[None, some], frac[None, some], "linear")[0]
+def _read_pixels(atlas: np.ndarray, at: FixedMap, interpolation: str) -> np.ndarray:
+    """The colours (n, 3) of the atlas at a map (1, n)."""
+    colours = np.empty((1, at.xy.shape[1], 3), atlas.dtype)
+    for first in range(0, colours.shape[1], _REMAP_COLUMNS):
+        some = np.s_[:, first : first + _REMAP_COLUMNS]
+        _remap(atlas, at.xy[some], at.frac[some], interpolation, dst=colours[some])
+    return colours[0]
 
 
-def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:
+def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], memory: Memory) -> np.ndarray:
     """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 images; a channels-last block is used uncopied."""
     block = _stacked_block(layout, images)
     if block is not None:
         return block
-    dtype = np.uint8 if images[0].dtype == torch.uint8 else np.float32
-    atlas = scratch.get("atlas", (*layout.size, 3), dtype)
+    atlas = memory.empty((*layout.size, 3), images[0].numpy().dtype)
+    if atlas.dtype != np.uint8:
+        atlas.fill(0)  # between slots too: a tap of weight 0 times NaN is NaN
     for slot in layout.slots:
         h, w = slot.size
         write_halved(images[slot.source], slot.level, atlas[slot.y : slot.y + h, slot.x : slot.x + w])
@@ -199,9 +193,7 @@ class Views:
         source_frame: Int8, 0 for the current frame, n + 1 for number n of its neighbours, -1 where uncovered.
         confidence: Float32 in [0, 1], 0 where uncovered.
         generated: Bool, True where a filler made up the pixel; None before filling.
-        layers: (h, w) uint8 of each view as in ``ViewPlan``, or None.
-        paint: ``ViewPlan.paint`` of each view, or None.
-        road: ``ViewPlan.road`` of each view, or None.
+        holes: ``ViewPlan.holes`` of each view.
         certainty: (h, w) uint8 of each view as in ``ViewPlan``, for ``confidence_of``.
         seams: (h, w) float32 change of each view by blending, for ``confidence_of``.
         curves: Tone curves of each view for each source; None if exposures are as recorded.
@@ -215,9 +207,7 @@ class Views:
     source_frame: Maps | None = None
     confidence: Maps | None = None
     generated: Maps | None = None
-    layers: Sequence[npt.NDArray[np.uint8] | None] = ()
-    paint: Sequence[Paint | None] = ()
-    road: Sequence[npt.NDArray[np.bool_] | None] = ()
+    holes: Sequence[HoleContents] = ()
     certainty: Sequence[npt.NDArray[np.uint8] | torch.Tensor] = ()
     seams: Sequence[torch.Tensor] = ()
     curves: Curves | None = None
@@ -260,7 +250,7 @@ class Renderer:
 
     def __init__(self, backend: Backend = "auto") -> None:
         self.backend = backend
-        self._scratch = Scratch()
+        self._memory = Memory()
 
     def render(
         self,
@@ -283,7 +273,7 @@ class Renderer:
                 batches.setdefault(id(plan), []).append(b)
                 continue
             seams: list[torch.Tensor] | None = [] if with_seams else None
-            views = render_opencv(plan, frame.images, self._scratch, curves[b], seams)
+            views = render_opencv(plan, frame.images, curves[b], seams, self._memory)
             rendered[b] = _make_views(plan, views, seams or (), curves[b], outputs)
         for members in batches.values():
             plan = plans[members[0]]
@@ -305,7 +295,7 @@ class Renderer:
         """The views (3, h, w) of one frame alone, executed as the images ``like`` would be."""
         if self._uses_torch(like):
             return [view[0] for view in render_torch(plan, [image[None] for image in images], [curves])]
-        return render_opencv(plan, images, self._scratch, curves)
+        return render_opencv(plan, images, curves, memory=self._memory)
 
     def _uses_torch(self, images: Sequence[torch.Tensor]) -> bool:
         needed = any(image.device.type != "cpu" or image.requires_grad for image in images)
@@ -324,8 +314,7 @@ def _make_views(
     views, on_device = plan.targets, plan.on_devices.get(images[0].device)
     winners = [view.source for view in on_device or ()] or [torch.from_numpy(view.source_camera) for view in views]
     rendered = from_winners(images, plan.target, winners, partial(render_labels, plan), outputs)
-    layers, paint, road = zip(*((view.layers, view.paint, view.road) for view in views), strict=True)
-    rendered = replace(rendered, layers=layers, paint=paint, road=road, curves=curves)
+    rendered = replace(rendered, holes=[view.holes for view in views], curves=curves)
     if "confidence" not in outputs:
         return rendered
     certainty = [view.certainty for view in on_device or views if view.certainty is not None]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -140,8 +140,17 @@ class RigPair:
 
     @cached_property
     def harm(self) -> str | None:
-        """Why a detector suffers if the target is rendered over a static surface; None if it does not."""
-        return static_harm(self.source, self.target, "street", self.config)
+        """How a detector suffers if cameras move over a static surface, for messages; None if it does not.
+
+        Objects are projected onto the road or the house behind them.
+        """
+        moved_m = float(self.baselines_m.min(axis=1).max())
+        if moved_m <= MOVED_M or not replace(self, geometry="auto").needs_geometry:
+            return None
+        return (
+            f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and a static surface does not "
+            f"know what stands on the street: objects lean and stretch. {STATIC_HARM}"
+        )
 
 
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # pixels on the border must not drop out by rounding in float32
@@ -158,27 +167,10 @@ def source_bounds(full: tuple[int, int], level: int) -> tuple[float, ...]:
     return first, first, right, bottom, *((w - 1, h - 1) if level else (-1, -1))
 
 
-def needs_geometry(source: Rig, target: Rig, geometry: str, config: RenderConfig) -> bool:
-    """``RigPair.needs_geometry`` of a target in its own ego frame."""
-    return RigPair(source, target.in_frame_of(source), geometry, config).needs_geometry
-
-
 def static_harm(source: Rig, target: Rig, geometry: str, config: RenderConfig) -> str | None:
-    """Explain how a detector suffers from cameras that move over a static surface; None if it does not.
-
-    Objects are projected onto the road or the house behind them. The target is in its own ego frame; the geometry is
-    the one that is rendered over, not ``auto``.
-    """
-    if not GEOMETRIES[geometry].is_static:
-        return None
-    pair = RigPair(source, target.in_frame_of(source), "auto", config)
-    moved_m = float(pair.baselines_m.min(axis=1).max())
-    if moved_m <= MOVED_M or not pair.needs_geometry:
-        return None
-    return (
-        f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and a static surface does not "
-        f"know what stands on the street: objects lean and stretch. {STATIC_HARM}"
-    )
+    """``RigPair.harm`` of a target in its own ego frame, for the geometry that is rendered over, not ``auto``."""
+    is_static = GEOMETRIES[geometry].is_static
+    return RigPair(source, target.in_frame_of(source), "auto", config).harm if is_static else None
 
 
 def stand_in_view(source: Rig, boxes: FloatArray) -> bool:
@@ -210,7 +202,7 @@ def boxes_harm(pair: RigPair, boxes: FloatArray | None) -> str | None:
 
 
 def harm_remedies(source: Rig, target: Rig) -> str:
-    """Remedies of ``static_harm``: data, or mixing with untouched samples."""
+    """Remedies of ``RigPair.harm``: data, or mixing with untouched samples."""
     mixing = "p=0.5" if len(source) == len(target) else "arbiview_aug.MixedDataset, since camera counts differ"
     return f"{HELPFUL_DATA}; or mixing with untouched samples ({mixing})"
 

@@ -78,10 +78,11 @@ class Pixels(NamedTuple):
     winner: Any  # (h, w) int8 number of the winning source, -1 for none
     xy: Any  # (h, w) int32, two int16: whole pixels in the atlas
     frac: Any  # (h, w) uint16 32nds of a pixel
-    second: Any  # (h, w) int8 number of the source that is blended in, -1 for none; given as -1; (0, 0) without seams
-    second_xy: Any  # (h, w) int32 its ``xy``, where ``shared``, as all that follow
-    second_frac: Any  # (h, w) uint16
-    share: Any  # (h, w) float32 its share
-    shared: Any  # (ny - 1, nx - 1) bool cells in which several sources have weight
+    count: Any  # (1,) int64 number of pixels into which a second source is blended; given as 0
+    pixel: Any  # (h w,) int64 these pixels, of the flattened view; (0,) without seams, as all that follow
+    second_xy: Any  # (h w,) int32 ``xy`` in the second source
+    share: Any  # (h w,) float32 its share
+    second_frac: Any  # (h w,) uint16
+    second: Any  # (h w,) int8 its number
     in_image: Any  # (h, w) uint8, not 0 where some source's image contains the pixel; (0, 0) where nothing hides
     won: Any  # (128,) int64 pixels that each source wins; given as 0

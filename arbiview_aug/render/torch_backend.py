@@ -1,8 +1,7 @@
 """Render plans executed by torch: batches, any device, differentiable in the images.
 
 Convention: grids are ``grid_sample``'s (align_corners=True) of the same positions that OpenCV reads, float32 for images
-of any type: half precision would move them visibly. All bands of a view are one list of pixels, since no pixel has more
-than one second source. A plan's grids are computed once for each device.
+of any type: half precision would move them visibly. A plan's grids are computed once for each device.
 """
 
 from __future__ import annotations
@@ -11,24 +10,13 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from arbiview_aug.render.harmonise import Curves
-from arbiview_aug.render.plan import AtlasLayout, RenderPlan, ViewPlan
-
-
-@dataclass(frozen=True)
-class Blend:
-    """The pixels of a view into which a second source is blended."""
-
-    pixel: torch.Tensor  # (n,) int64 into the flattened view
-    grid: torch.Tensor  # (1, n, 2) float32 positions in the second source
-    weight: torch.Tensor  # (n,) float32 share of the second source
-    source: torch.Tensor  # (n,) int64 index of the second source
+from arbiview_aug.render.plan import AtlasLayout, RenderPlan
 
 
 @dataclass(frozen=True)
@@ -36,17 +24,13 @@ class ViewMaps:
     """A target view's maps."""
 
     grid: torch.Tensor  # (h, w, 2) float32 positions in the winning source; outside the atlas where none sees
+    seam_grid: torch.Tensor  # (1, n, 2) float32 positions in second sources
     source: torch.Tensor  # (h, w) int8 index of the winning source, -1 where none sees
-    blend: Blend | None
+    pixel: torch.Tensor  # (n,) int64 pixels into which a second source is blended, of the flattened view
+    second: torch.Tensor  # (n,) int8 index of the second source
+    weight: torch.Tensor  # (n,) float32 share of the second source
     edge: torch.Tensor | None  # (n,) int64 as in ``ViewPlan``, like the next one
     certainty: torch.Tensor | None  # (h, w) uint8
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes."""
-        blend = () if self.blend is None else vars(self.blend).values()
-        tensors = self.grid, self.source, self.certainty, self.edge, *blend
-        return sum(tensor.nbytes for tensor in tensors if tensor is not None)
 
 
 def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
@@ -56,57 +40,27 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
             views, size = list[ViewMaps](), plan.layout.size
             for target in plan.targets:
-                arrays = target.edge, target.certainty
-                edge, certainty = (None if part is None else torch.from_numpy(part).to(device) for part in arrays)
-                grid, blend = _grid(target.at.to_float(), size, device), _blend(target, size, device)
-                views.append(ViewMaps(grid, torch.from_numpy(target.source_camera).to(device), blend, edge, certainty))
+                seam = target.seam
+                grids = [_grid(at.to_float(), size, device) for at in (target.at, seam.at)]
+                maps = target.source_camera, seam.pixel, seam.source, seam.weight, target.edge, target.certainty
+                views.append(ViewMaps(*grids, *(None if m is None else torch.from_numpy(m).to(device) for m in maps)))
             plan.on_devices[device] = tuple(views)
     return plan.on_devices[device]
 
 
-def _blend(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) -> Blend | None:
-    if not target.bands:
-        return None
-    width = target.source_camera.shape[1]
-    pixels, positions, weights, sources = [], [], [], []
-    for band in target.bands:
-        y, x = np.nonzero(band.weight)
-        pixels.append((y + band.y) * width + x + band.x)
-        positions.append(band.at.to_float()[y, x])
-        weights.append(band.weight[y, x])
-        sources.append(np.full(len(y), band.source))
-    grid = _grid(np.concatenate(positions)[None], atlas_size, device)
-    pixel, weight, source = (torch.from_numpy(np.concatenate(parts)).to(device) for parts in (pixels, weights, sources))
-    return Blend(pixel, grid, weight, source)
-
-
 def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
     """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; 0 between slots."""
-    rows, columns = layout.size
-    if not layout.slots:
-        return torch.zeros((len(images[0]), 3, rows, columns), device=images[0].device)
-    edges = [*sorted({slot.x for slot in layout.slots}), columns]
-    parts = []
-    for left, right in pairwise(edges):
-        y, pieces = 0, []
-        for slot in sorted((slot for slot in layout.slots if slot.x == left), key=lambda slot: slot.y):
-            image, is_uint8 = images[slot.source], images[slot.source].dtype == torch.uint8
-            if slot.level or not is_uint8:
-                image = image.float()  # autocast joins no float16
-            for _ in range(slot.level):
-                image = torch.nn.functional.avg_pool2d(image, 2)
-                image = torch.floor(image + 0.5) if is_uint8 else image  # as OpenCV rounds
-            pieces.append(_padded(image, right - left - slot.size[1], slot.y - y, 0))
-            y = slot.y + slot.size[0]
-        parts.append(_padded(torch.cat(pieces, 2), 0, 0, rows - y))
-    atlas = (parts[0] if len(parts) == 1 else torch.cat(parts, 3)).float()
-    return torch.nn.functional.pad(atlas, (edges[0], 0)) if edges[0] else atlas  # no view reads the first column
-
-
-def _padded(image: torch.Tensor, right: int, above: int, below: int) -> torch.Tensor:
-    """An image padded with zeros; the same tensor if nothing is padded."""
-    is_padded = right or above or below
-    return torch.nn.functional.pad(image, (0, right, above, below)) if is_padded else image
+    atlas = torch.zeros((len(images[0]), 3, *layout.size), device=images[0].device)
+    for slot in layout.slots:
+        image, (h, w) = images[slot.source], slot.size
+        if slot.level:
+            image = image.float()
+        for _ in range(slot.level):
+            image = torch.nn.functional.avg_pool2d(image, 2)
+            if images[0].dtype == torch.uint8:
+                image = torch.floor(image + 0.5)  # as OpenCV rounds
+        atlas[..., slot.y : slot.y + h, slot.x : slot.x + w] = image
+    return atlas
 
 
 def _grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:
@@ -154,30 +108,18 @@ def render_torch(
         if tones is not None:
             view = tones(view, maps.source.long(), torch.arange(len(maps.source), device=device)[:, None])
         change = view.new_zeros(view.shape[0], *view.shape[2:])
-        if maps.blend is not None:
-            view = _blended(view, atlas, maps.blend, target.seam_interpolation, tones, change)
+        if len(maps.pixel):
+            second = _sample(atlas, maps.seam_grid, target.seam_interpolation)[:, :, 0]  # [B, 3, n]
+            if tones is not None:
+                second = tones(second, maps.second.long(), maps.pixel // view.shape[-1])
+            first = view.flatten(2)[:, :, maps.pixel]
+            change.flatten(1)[:, maps.pixel] = (first - second).detach().abs().mean(1) * maps.weight
+            mixed = torch.lerp(first, second, maps.weight.expand_as(second))
+            view = view.flatten(2).index_copy(2, maps.pixel, mixed).view_as(view)
         if seams is not None:
             seams.append(change)
         views.append(view.round().clamp(0, 255).to(dtype) if dtype == torch.uint8 else view.to(dtype))
     return views
-
-
-def _blended(
-    view: torch.Tensor,
-    atlas: torch.Tensor,
-    blend: Blend,
-    interpolation: str,
-    tones: Callable[..., torch.Tensor] | None,
-    change: torch.Tensor,
-) -> torch.Tensor:
-    """Blend the second sources into a view (B, 3, h, w), and write the change to ``change`` (B, h, w)."""
-    second = _sample(atlas, blend.grid, interpolation)[:, :, 0]  # [B, 3, n]
-    if tones is not None:
-        second = tones(second, blend.source, blend.pixel // view.shape[-1])
-    first = view.flatten(2)[:, :, blend.pixel]
-    change.flatten(1)[:, blend.pixel] = (first - second).detach().abs().mean(1) * blend.weight
-    mixed = torch.lerp(first, second, blend.weight.expand_as(second))
-    return view.flatten(2).index_copy(2, blend.pixel, mixed).view_as(view)
 
 
 def _toned(view: torch.Tensor, source: torch.Tensor, row: torch.Tensor, curves: torch.Tensor, top: int) -> torch.Tensor:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import BoolArray, FloatArray, LensName
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import RayCache, look_apart
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
@@ -27,10 +27,11 @@ from arbiview_aug.render.plan import (
     GRID_STEP_PX,
     ROAD_M,
     AtlasLayout,
-    BlendRegion,
     FixedMap,
+    HoleContents,
     RenderConfig,
     RenderPlan,
+    Seam,
     SourceUse,
     ViewPlan,
 )
@@ -51,7 +52,6 @@ MAGNIFIED = 0.8
 """A view is read by cubics where it has at most this many source pixels per pixel, and is mostly read at its own
 centre: docs/decisions.md."""
 
-_STRIP_PX = 128  # height of strips in which bands along seams are rectangles
 _NO_IMAGE, _NO_FACES, _NO_PARTS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32), np.zeros(0, np.int32)
 
 
@@ -200,7 +200,7 @@ class ViewPlanner:
 
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:
-        """Winners, maps into the atlas, and blended bands."""
+        """Winners, maps into the atlas, and blended pixels."""
         from arbiview_aug.render.kernels import BLOCK_PX, FLOAT_ROWS, INT_ROWS, plan_pixels, see_nodes
         from arbiview_aug.render.paint_kernels import find_paint
 
@@ -213,26 +213,26 @@ class ViewPlanner:
             see_nodes(view, sources, surfaces, occluders, self.nodes, *scratch)
         xy, frac, winner = memory.empties(size, np.int32, np.uint16, np.int8)
         at = FixedMap(xy.view(np.int16).reshape(*size, 2), frac)
-        blended = size if self.config.seam_width and len(self.sources) > 1 else (0, 0)
-        second_xy, share, second_frac, second = memory.empties(blended, np.int32, np.float32, np.uint16, np.int8)
-        second.fill(-1)
-        shared, won_px = np.empty((len(view.y) - 1, len(view.x) - 1), bool), np.zeros(128, np.int64)
-        in_image, seconds = memory.empty(size if hides else (0, 0), np.uint8), (second, second_xy, second_frac, share)
-        pixels = Pixels(winner, xy, frac, *seconds, shared, in_image, won_px)
-        sets = np.empty((2, shared.shape[1]), np.int64)
+        most_blended = winner.size if self.config.seam_width and len(self.sources) > 1 else 0
+        seconds = memory.empties((most_blended,), np.int64, np.int32, np.float32, np.uint16, np.int8)
+        in_image, won_px = memory.empty(size if hides else (0, 0), np.uint8), np.zeros(128, np.int64)
+        outputs: list[Any] = [winner, xy, frac, np.zeros(1, np.int64), *seconds, in_image, won_px]
+        pixels = Pixels(*outputs)
+        sets = np.empty((2, len(view.x) - 1), np.int64)
         weights = self._weights(), self.nodes.near
         plan_pixels(view, sources, surfaces, occluders, *weights, self.wanted, pixels, *scratch, sets)
-        bands = self._bands(pixels) if shared.any() and blended[0] else ()
+        pixel, to_xy, weight, to_frac, number = (part[: int(pixels.count[0])].copy() for part in seconds)
+        seam = Seam(pixel, number, FixedMap(to_xy.view(np.int16).reshape(1, -1, 2), to_frac[None]), weight)
         certain = self._certainty(winner) if self.config.certainty else None
         interpolation = self._interpolation(won_px)
         if interpolation == "nearest":
-            at, bands = at.rounded(), tuple(replace(band, at=band.at.rounded()) for band in bands)
+            at, seam = at.rounded(), replace(seam, at=seam.at.rounded())
         edge = self._edge(at, winner, layout) if interpolation == "cubic" else None
         measured = None
         if self.name in self._surfaces and not self._surface(self.name).is_guess:
             measured = self._seen(self.name).q
         reports = tuple(self._reports(winner, won_px))
-        plan = ViewPlan(at, winner, bands, reports, interpolation, certain, edge, measured=measured)
+        plan = ViewPlan(at, winner, seam, reports, interpolation, certain, edge, measured=measured)
         if not self.config.layers or won_px.sum() == winner.size:
             return plan
         layers = ((winner < 0) & (in_image > 0)).view(np.uint8) if hides else np.zeros(size, np.uint8)
@@ -247,14 +247,14 @@ class ViewPlanner:
             if surfaces.face.size or layers.any():
                 parts = self._surface(name).face_parts if surfaces.face.size else _NO_PARTS
                 paint = find_paint(surfaces.q, surfaces.face, parts, winner, view.step, layers)
-        return replace(plan, layers=layers if layers.any() else None, paint=paint, road=road)
+        return replace(plan, holes=HoleContents(layers if layers.any() else None, paint, road))
 
     def _weights(self) -> npt.NDArray[np.float32]:
         """Weights (K, ny, nx) of the sources: their scores, for one source or hard seams.
 
         A seam blends each source over its weight around the area that it wins, which fades at its own border.
         """
-        from arbiview_aug.render.node_kernels import soften, win_nodes
+        from arbiview_aug.render.node_kernels import win_nodes
 
         width_px, view, nodes = self.config.seam_width * self.camera.width_px, self.view, self.nodes
         if width_px == 0 or len(self.sources) < 2:
@@ -262,27 +262,15 @@ class ViewPlanner:
         labelled = self.scene.boxes if "boxes" in GEOMETRIES[self.pair.geometry].reads else None
         boxes = np.zeros((0, 7)) if labelled is None else labelled[:, :7]
         near_last = np.argsort(-((boxes[:, :3] - view.center_m) ** 2).sum(axis=-1), kind="stable")
-        winner, weights = np.empty(nodes.score.shape[1:], np.int8), np.empty_like(nodes.score)
+        winner, side = np.empty(nodes.score.shape[1:], np.int8), 2 * max(1, round(width_px / view.step / 2)) + 1
         win_nodes(view, nodes, boxes[near_last], winner)
-        soften(winner, nodes.border, max(1, round(width_px / view.step / 2)), width_px, weights)
+        weights = np.clip(nodes.border / np.float32(width_px), 0, 1)
+        for k, weight in enumerate(weights):
+            soft = (winner == k).astype(np.float32)
+            for _ in range(2):  # two passes of a box make a smooth ramp
+                soft = cv2.blur(soft, (side, side), borderType=cv2.BORDER_REPLICATE)
+            weight *= soft
         return weights
-
-    def _bands(self, pixels: Pixels) -> tuple[BlendRegion, ...]:
-        """Rectangles around the pixels that a second source adds to, in content order: they overlap."""
-        from arbiview_aug.render.kernels import cut_bands, find_bands
-
-        strips, columns = -(-len(pixels.winner) // _STRIP_PX), pixels.shared.shape[1]
-        bands = np.empty((len(self.sources) * strips * columns, 5), np.int64)
-        bands = bands[: find_bands(pixels, self.view.step, _STRIP_PX, np.array(self.sources), bands)]
-        size = np.stack([bands[:, 2] - bands[:, 1], bands[:, 4] - bands[:, 3]], -1)
-        ends = [0, *np.cumsum(size.prod(axis=1)).tolist()]
-        xy, frac, weight = (np.empty(ends[-1], kind) for kind in (np.int32, np.uint16, np.float32))
-        cut_bands(pixels, bands, xy, frac, weight)
-        regions = []
-        for (source, y0, _, x0, _), (h, w), a, b in zip(bands.tolist(), size.tolist(), ends, ends[1:], strict=False):
-            at = FixedMap(xy[a:b].view(np.int16).reshape(h, w, 2), frac[a:b].reshape(h, w))
-            regions.append(BlendRegion(y0, x0, source, at, weight[a:b].reshape(h, w)))
-        return tuple(regions)
 
     def _certainty(self, winner: npt.NDArray[np.int8]) -> npt.NDArray[np.uint8]:
         """``confidence.certainty`` (h, w) of the winning sources in 255ths."""
@@ -439,20 +427,16 @@ def warm_up() -> None:
     """Compile the kernels of cameras and of plans over objects, or load them from numba's cache."""
     from arbiview_aug.render.photometry_kernels import read_ahead
 
-    # A lens without and one with an array of rays: kernels are compiled once for all lenses.
-    lenses: tuple[tuple[LensName, tuple[float, ...]], ...] = ("pinhole", ()), ("fisheye", (0.0,) * 4)
-    views = [
+    left, middle, right = (
         Camera.looking(
-            name=f"{lens} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
-            horizontal_fov_deg=90, lens=lens, distortion=distortion,
+            name=f"{side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
+            horizontal_fov_deg=90, lens="fisheye", distortion=(0.0,) * 4,
         )
-        for lens, distortion in lenses for side in (-1, 0, 1)
-    ]  # fmt: skip
+        for side in (-1, 0, 1)
+    )  # fmt: skip
     boxes = np.array([[8.5, 0, 1, 1, 4, 2, 0], [5, 3, 1, 1, 1, 2, 0]])
-    source = Rig(
-        [replace(camera, mask=np.eye(32, dtype=bool) < 1) for camera in views if not camera.name.endswith("0")]
-    )
-    target = Rig([camera for camera in views if camera.name.endswith("0")])
+    source = Rig([replace(camera, mask=np.eye(32, dtype=bool) < 1) for camera in (left, right)])
+    target = Rig([middle])
     scene, config = Scene(boxes=boxes), RenderConfig(certainty=True)
     for surface in ("ground", "boxes"):
         plan = build_plan(source, target, geometry=surface, config=config, scene=scene)

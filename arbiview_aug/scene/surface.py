@@ -7,7 +7,6 @@ corrected by overlapping cameras.
 
 from __future__ import annotations
 
-import hashlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -249,19 +248,9 @@ class Correction:
     share: Layer  # (h, w) float32 weight in [0, 1], which fades to 0 towards the borders of the view
 
     @cached_property
-    def key(self) -> bytes:
-        """Content hash."""
-        return hashlib.sha256(self.view.content_key + self.change.tobytes() + self.share.tobytes()).digest()
-
-    @cached_property
     def planes(self) -> Layer:
         """(h, w, 2): change times share, and share."""
         return np.dstack([self.change * self.share, self.share])
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes."""
-        return 2 * (self.change.nbytes + self.share.nbytes)
 
 
 @dataclass(frozen=True)

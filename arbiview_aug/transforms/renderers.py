@@ -22,7 +22,7 @@ from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.inpaint.neighbours import Fills, Reach, fill_from_neighbours, plan_fills
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
-from arbiview_aug.render.overlap_depth import OverlapDepth, estimate_overlap, overlap_cache
+from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, Renderer, Views
 from arbiview_aug.render.requirements import RigPair, boxes_harm, check_reach, harm_remedies, pose_mistakes
@@ -39,7 +39,7 @@ from arbiview_aug.sample.inputs import (
 from arbiview_aug.sample.neighbours import points_of_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.sky import sky_points
-from arbiview_aug.transforms.settings import PlanCache, unseen_note
+from arbiview_aug.transforms.settings import unseen_note
 
 _MIXED_P = 0.5
 """At most this share of retargeted samples, views over a static street do not harm a detector
@@ -57,7 +57,7 @@ class RendererSettings:
     reach: Reach | None  # area that neighbouring frames may fill
     match_exposure: Harmonise
     backend: Backend
-    cache: PlanCache
+    cache_bytes: int  # for plans of recurring rigs
     outputs: Collection[str]  # requested maps, as in ``Renderer.render``
     inpainter: Inpainter  # fills the remaining holes
     p: float  # share of samples that are retargeted
@@ -157,14 +157,13 @@ class PlannedRenderer:
     """Renders frames over their scenes, by plans; holes are filled from neighbouring frames alone."""
 
     def __init__(self, config: RenderConfig, settings: RendererSettings) -> None:
-        inpainter, cache = settings.inpainter, settings.cache
+        inpainter = settings.inpainter
         certainty = config.certainty or "confidence" in settings.outputs or inpainter.needs_confidence
         self.config = replace(config, certainty=certainty, layers=inpainter.needs_layers)
         self.settings, self.geometry, self.warn = settings, settings.geometry, settings.warn
         self.outputs = (*settings.outputs, "confidence") if certainty else tuple(settings.outputs)
         self.harmoniser, self.backend = Harmoniser(settings.match_exposure), Renderer(settings.backend)
-        self.overlaps = overlap_cache(cache.share_overlap, config)  # shared by frames, or None
-        self.plans: LRUCache[Any, RenderPlan] = LRUCache(cache.max_bytes, attrgetter("nbytes"))  # of recurring rigs
+        self.plans: LRUCache[Any, RenderPlan] = LRUCache(settings.cache_bytes, attrgetter("nbytes"))
         self._maps, self._unseen = RayCache(), unseen_note(inpainter)
         self._pairs: LRUCache[Any, RigPair] = LRUCache(_MAX_RIG_PAIRS)
 
@@ -198,7 +197,7 @@ class PlannedRenderer:
         geometry = scene.best if self.geometry == "auto" else self.geometry
         if pair.needs_geometry:
             if self.config.overlap_depth and GEOMETRIES[geometry].overlap_depth:
-                overlap = estimate_overlap(frame, scene.boxes, self.settings.cache.share_overlap, self.overlaps)
+                overlap = overlap_depth(frame.rig, frame.images, scene.boxes)
                 scene = replace(scene, corrections=overlap.corrections)
             if row.needs == "motion" and not temporal.brings_motion(frame, self.geometry):
                 motion = temporal.estimate_motion(frame, scene.boxes, self.warn)
@@ -218,17 +217,18 @@ class PlannedRenderer:
             scene = replace(scene, motion=motion.maps(frame.rig, before) if motion else ())
         return scene, geometry, overlap, motion
 
-    def plan_views(self, source: Rig, target: Rig, scene: Scene) -> RenderPlan:
-        """The plan of a source and a target rig in a scene, as ``plan`` makes it."""
-        return self._plan_views(self._pair(source, target), scene)
+    def prepare(self, source: Rig, target: Rig) -> RenderPlan:
+        """The plan of all frames of a pair of rigs; ValueError if they need one each."""
+        pair = self._pair(source, target)
+        if GEOMETRIES[self.geometry].needs is not None and pair.needs_geometry:
+            got = f"{self.geometry!r}: boxes, points or depth need a new plan for every frame"
+            raise ValueError(f"prepare: expected a geometry whose plans come back, got {got}")
+        return self._plan_views(pair, Scene())
 
     def _plan_views(self, pair: RigPair, scene: Scene) -> RenderPlan:
         """The plan of a pair in a scene; cached unless pixels depend on one frame's geometry, which never recurs."""
         if scene.is_empty or not pair.needs_geometry:
-            return self.plans.get((pair.key, ()), lambda: self._build(pair, Scene()))
-        if self.overlaps is not None and scene.best == "street":
-            key = pair.key, tuple(correction.key for correction in scene.corrections)
-            return self.plans.get(key, lambda: self._build(pair, scene))
+            return self.plans.get(pair.key, lambda: self._build(pair, Scene()))
         return self._build(pair, scene)
 
     def _build(self, pair: RigPair, scene: Scene) -> RenderPlan:
@@ -280,7 +280,6 @@ class PaperRenderer:
         self.settings = settings
         self.harmoniser = Harmoniser(settings.match_exposure is not True and settings.match_exposure)
         self.plans: LRUCache[Any, RenderPlan] = LRUCache(0)
-        overlap_cache(settings.cache.share_overlap, config)  # refused
         least = settings.inpainter.min_confidence
         favs.check_settings(
             settings.target, settings.geometry, settings.backend, settings.outputs, least, self.harmoniser
@@ -288,7 +287,7 @@ class PaperRenderer:
 
     reads: ClassVar[tuple[str, ...]] = ()
 
-    def plan_views(self, source: Rig, target: Rig, scene: Scene) -> RenderPlan:
+    def prepare(self, source: Rig, target: Rig) -> RenderPlan:
         """Raises ValueError."""
         raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
 

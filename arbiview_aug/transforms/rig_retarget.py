@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import cache, cached_property, wraps
 from itertools import chain
 from pathlib import Path
@@ -28,7 +27,6 @@ from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.render.harmonise import Harmonise
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, Resizer
-from arbiview_aug.render.requirements import needs_geometry
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import (
     DEPTH_WORDS,
@@ -38,7 +36,7 @@ from arbiview_aug.sample.inputs import (
     read_frames,
     refuse_camera_values,
 )
-from arbiview_aug.scene.scene import GEOMETRIES, Scene
+from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.outputs import SampleWriter
 from arbiview_aug.transforms.renderers import (
     Explanation,
@@ -48,8 +46,8 @@ from arbiview_aug.transforms.renderers import (
     RendererSettings,
 )
 from arbiview_aug.transforms.settings import (
-    PlanCache,
     SampleKeys,
+    checked_bytes,
     checked_instance,
     checked_params,
     checked_pixels,
@@ -119,7 +117,8 @@ class RigRetarget(torch.nn.Module):
             ``p < 1`` needs ``size`` and equal camera counts (else see ``MixedDataset``). Each call draws again; calls
             of one sequence share the draw with a ``RandomRig(per="sequence")``.
         keys: Label maps, further outputs and frames: ``SampleKeys``.
-        cache: Limits of the plans kept from call to call.
+        cache_bytes: Memory for plans of calibrations that come back; the least recently used go first. Pickles and
+            copies hold none: each DataLoader worker fills its own.
         backend: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
 
@@ -151,7 +150,7 @@ class RigRetarget(torch.nn.Module):
         fit: Fit = "crop",
         p: float = 1.0,
         keys: SampleKeys = SampleKeys(),  # noqa: B008 - frozen
-        cache: PlanCache = PlanCache(),  # noqa: B008 - frozen
+        cache_bytes: int = 512 * 2**20,
         backend: Backend = "auto",
     ) -> None:
         super().__init__()
@@ -164,7 +163,7 @@ class RigRetarget(torch.nn.Module):
         if self.p < 1 and size is None:
             raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
         self.size = None if size is None else checked_pixels(size)
-        self.keys, self.cache = checked_instance("keys", keys, SampleKeys), checked_instance("cache", cache, PlanCache)
+        self.keys, self.cache_bytes = checked_instance("keys", keys, SampleKeys), checked_bytes(cache_bytes)
         refuse_camera_values(self.keys.labels)
         self.inpainter = inpainter_of(holes)  # moves with this module
         self._warn, self._checked = WarnOnce(), set[frozenset[Any]]()  # keys and types of samples that were checked
@@ -187,7 +186,7 @@ class RigRetarget(torch.nn.Module):
             reach=self.neighbours,
             match_exposure=exposure,
             backend=choice("backend", backend, get_args(Backend)),
-            cache=self.cache if is_reused else replace(self.cache, max_bytes=0),
+            cache_bytes=self.cache_bytes if is_reused else 0,
             outputs=self.keys.extra,
             inpainter=self.inpainter,
             p=self.p,
@@ -218,8 +217,7 @@ class RigRetarget(torch.nn.Module):
             f"geometry={self.geometry}, holes={type(self.inpainter).__name__}, size={self.size}, fit={self.fit}, "
             f"match_exposure={self.renderer.harmoniser}, p={self.p:g}"
         )
-        cache = "" if self.cache.share_overlap is False else f"{self.cache!r}, "
-        return f"target={target}, {settings}, {cache}{self.renderer.config}"
+        return f"target={target}, {settings}, {self.renderer.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
     @_eager_on_cpu
@@ -267,7 +265,6 @@ class RigRetarget(torch.nn.Module):
             further |= {"points", "boxes_3d"} | ({"neighbours"} if self.neighbours else set())
         names = {key for name, key in DEPTH_WORDS.items() if name in GEOMETRIES[renderer.geometry].reads}
         names |= {"token"} if self.inpainter.is_random else set()
-        names |= {share} if isinstance(share := self.cache.share_overlap, str) else set()
         return read_frames(sample, self.source, renderer.geometry, further=further, names=names, warn=self._warn)
 
     def _scan_points(self, frames: Sequence[Frame], target: Rig, is_skipped: bool = False) -> list[Any]:
@@ -322,10 +319,6 @@ class RigRetarget(torch.nn.Module):
         return target.with_cameras([c.resize(framing(c.name, c.size, self._bars, "pad").scaled) for c in target])
 
     # --- plans ------------------------------------------------------------------------------------------------------
-    def plan(self, source: Rig | str | Path, target: Rig | str | Path, scene: Scene | None = None) -> RenderPlan:
-        """The cached render plan of a pair of rigs in a scene; ValueError with ``quality="paper"``."""
-        return self.renderer.plan_views(load_rig(source), load_rig(target), scene or Scene())
-
     def prepare(self, source: Rig | str | Path | None = None) -> RenderPlan:
         """Build the plan for a source rig before DataLoader workers fork: they share its memory.
 
@@ -339,11 +332,7 @@ class RigRetarget(torch.nn.Module):
         if source is None or isinstance(self.target, RandomRig):
             got = f"{'no source' if source is None else 'a source'} and a target {type(self.target).__name__}"
             raise ValueError(f"prepare: expected a source rig and a fixed target rig, got {got}")
-        target, row = self._fixed_target, GEOMETRIES[self.geometry]
-        if row.needs is not None and needs_geometry(source, target, self.geometry, self.renderer.config):
-            got = f"{self.geometry!r}: boxes, points or depth need a new plan for every frame"
-            raise ValueError(f"prepare: expected a geometry whose plans come back, got {got}")
-        return self.renderer.plan_views(source, target, Scene())
+        return self.renderer.prepare(source, self._fixed_target)
 
     # --- reports ----------------------------------------------------------------------------------------------------
     def explain(self, sample: Mapping[str, Any]) -> Explanation | favs.PaperRendering:

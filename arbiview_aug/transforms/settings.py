@@ -71,30 +71,6 @@ class SampleKeys:
             choice(f"SampleKeys.{name}", getattr(self, name), ("source", "target"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlanCache:
-    """Plans that a transform keeps between calls. Pickles and copies are empty: each DataLoader worker fills its own.
-
-    Attributes:
-        max_bytes: Memory for plans of recurring calibrations; the least recently used go first.
-        share_overlap: Frames that share the depth from overlap of ``quality="accurate"``, which depends on the images.
-            False: none. A key of the sample, for example of a scene token: those with the same value and calibration.
-            True: all with one calibration, which is right only for a vehicle at rest.
-
-    Raises:
-        ValueError: Impossible values.
-    """
-
-    max_bytes: int = 512 * 2**20
-    share_overlap: bool | str = False
-
-    def __post_init__(self) -> None:
-        if not is_number(self.max_bytes) or not self.max_bytes >= 0:
-            raise ValueError(f"PlanCache.max_bytes: expected a number of bytes from 0, got {self.max_bytes!r}")
-        if not isinstance(self.share_overlap, bool | str):
-            raise ValueError(f"PlanCache.share_overlap: expected a bool or a sample key, got {self.share_overlap!r}")
-
-
 def render_config(quality: Any) -> Any:
     """A preset by its name, or the ``RenderConfig`` or ``PaperConfig`` itself; ValueError for anything else."""
     if isinstance(quality, str) and quality in (*PRESETS, "paper"):
@@ -134,6 +110,13 @@ def checked_instance(name: str, value: Any, kind: type[T]) -> T:
     """Return ``value`` if it is an instance of ``kind``; ValueError for anything else."""
     if not isinstance(value, kind):
         raise ValueError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
+def checked_bytes(value: Any) -> int:
+    """A number of bytes from 0; ValueError for anything else."""
+    if not is_number(value) or not value >= 0:
+        raise ValueError(f"cache_bytes: expected a number of bytes from 0, got {shown(value)}")
     return value
 
 

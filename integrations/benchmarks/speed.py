@@ -36,7 +36,6 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
@@ -328,7 +327,7 @@ def bytes_moved(plan: RenderPlan, images: Sequence[torch.Tensor]) -> int:
     """Least number of bytes that rendering images (B, 3, H, W) moves."""
     read = sum(images[k].nbytes for k in {slot.source for slot in plan.layout.slots})
     maps = maps_on(plan, images[0].device)
-    grids = sum(view.grid.nbytes + (0 if view.blend is None else view.blend.grid.nbytes) for view in maps)
+    grids = sum(view.grid.nbytes + view.seam_grid.nbytes for view in maps)
     pixels = sum(view.source.numel() for view in maps)
     return read + grids + pixels * 3 * images[0].shape[0] * images[0].element_size()
 
@@ -344,7 +343,7 @@ def _held(sample: Sample, target: Rig, **settings: Any) -> Callable[[], Any]:
 
 def _anew(sample: Sample, target: Rig, surface: GeometryName, **settings: Any) -> Callable[[], Any]:
     """Call with the rig, over the street, always a little elsewhere; plans over a frame's geometry never come back."""
-    retarget = RigRetarget(target, geometry=surface, cache=PlanCache(max_bytes=0), **_PLAIN | settings)
+    retarget = RigRetarget(target, geometry=surface, cache_bytes=0, **_PLAIN | settings)
     rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(_STEPS if surface == "street" else 1)])
     return lambda: retarget({**sample, "rig": next(rigs)})
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 
-from arbiview_aug import PaperConfig, PlanCache, RenderConfig, Rig, SampleKeys
+from arbiview_aug import PaperConfig, RenderConfig, Rig, SampleKeys
 from tests.helpers import camera
 from tests.mutations import NUMBERS, TEXT_JUNK, mutated
 
@@ -137,21 +137,19 @@ def settings(draw: st.DrawFn, keys: Collection[str]) -> dict[str, Any]:
         "match_exposure": (True, True, True, False, (1.1, 0.9)),
         "backend": ("auto", "auto", "auto", "torch"),
         "extra": ((), (), ("confidence",), ("confidence", "source_camera")),
-        "cache": (PlanCache(), PlanCache(share_overlap="scene")),
     }
     chosen = {name: draw(st.sampled_from(values)) for name, values in choices.items()}
     is_paper, extra, frame = chosen["quality"] == "paper", chosen.pop("extra"), chosen.pop("frame")
     chosen |= chosen.pop("size") | {
         "keys": SampleKeys(frame=frame, labels=("labels",), extra=() if is_paper else extra)
     }
-    unused = ("geometry", "match_exposure", "backend", "cache") if is_paper else ()
-    unused += ("cache",) if chosen["quality"] != "accurate" else ()
+    unused = ("geometry", "match_exposure", "backend") if is_paper else ()
     return {name: value for name, value in chosen.items() if name not in unused}
 
 
 SETTING_NAMES = (
     *("source", "geometry", "holes", "quality", "neighbours", "match_exposure"),
-    *("size", "fit", "p", "keys", "cache", "backend"),
+    *("size", "fit", "p", "keys", "cache_bytes", "backend"),
 )
 
 SETTING_JUNK: tuple[Callable[[], Any], ...] = (

@@ -17,7 +17,7 @@ from arbiview_aug.inpaint import continued as holes_module
 from arbiview_aug.inpaint.continued import Continue, Mean, fill_holes, object_colours
 from arbiview_aug.inpaint.inpainter import Inpainter, Telea
 from arbiview_aug.render.paint_kernels import find_paint
-from arbiview_aug.render.plan import OBJECT, OCCLUDED, Paint
+from arbiview_aug.render.plan import OBJECT, OCCLUDED, HoleContents, Paint
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import PARTS, TOP_PART
@@ -46,10 +46,10 @@ def gradient(height: int, width: int) -> torch.Tensor:
 def fill_hole(
     view: torch.Tensor, seen: torch.Tensor, seen_by: Camera | None = None, **plan: np.ndarray | Paint
 ) -> torch.Tensor:
-    """A view with its hole filled by what is known of it: ``layers``, ``paint`` and ``road`` as in ``ViewPlan``."""
+    """A view with its hole filled by what is known of it: ``HoleContents``."""
     rig = Rig([camera(size=tuple(seen.shape)) if seen_by is None else seen_by])
-    parts: dict[str, Any] = {name: [value] for name, value in plan.items()}
-    (out,) = fill_holes(Views([view * seen], rig, [seen], **parts))
+    contents: Any = plan
+    (out,) = fill_holes(Views([view * seen], rig, [seen], holes=[HoleContents(**contents)]))
     return out
 
 
@@ -145,7 +145,7 @@ def test_what_the_own_car_hides_is_continued() -> None:
 def test_a_whole_target_asks_for_no_filling(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(holes_module, "object_colours", None)
     source = ring()
-    assert all(view.layers is view.paint is None for view in build_plan(source, source).targets)
+    assert all(view.holes == HoleContents() for view in build_plan(source, source).targets)
     images = torch.randint(0, 255, (6, 3, 72, 96), dtype=torch.uint8)
     out = RigRetarget(source)({"images": images, "rig": source})
     assert out["coverage"].all() and not out["generated"].any() and torch.equal(out["images"], images)

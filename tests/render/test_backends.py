@@ -10,7 +10,7 @@ import torch
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.favs.stage1_geometry import h_geom
-from arbiview_aug.image_ops import Scratch
+from arbiview_aug.image_ops import Memory
 from arbiview_aug.render.photometry_kernels import read_ahead
 from arbiview_aug.render.plan import AtlasLayout, FixedMap, RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import render_labels, render_opencv
@@ -93,12 +93,12 @@ def test_memory_layouts_and_dtypes_give_the_same_views() -> None:
     target = rig.turned(yaw_deg=15).resized(0.45)
     images = noise_images(rig)
     for target in (rig.turned(yaw_deg=15), rig.turned(yaw_deg=15).resized(0.45)):
-        plan, scratch = build_plan(rig, target), Scratch()
+        plan, memory = build_plan(rig, target), Memory()
         expected = render_opencv(plan, images)
         block = torch.stack(images).contiguous(memory_format=torch.channels_last)  # one block: used without a copy
         planar = [image.contiguous() for image in images]
         for layout in (block, planar, list(block)):
-            assert differences(expected, render_opencv(plan, list(layout), scratch)).max() == 0
+            assert differences(expected, render_opencv(plan, list(layout), memory=memory)).max() == 0
         floats = render_opencv(plan, [image.float() / 255 for image in planar])
         assert differences(expected, [(v * 255).round() for v in floats]).max() <= 1
         half = render_opencv(plan, [(image.float() / 255).half() for image in planar])
@@ -137,8 +137,8 @@ def test_slices_of_one_block_of_rows_may_differ_in_height() -> None:
 def test_nearest_pixels_are_whole_ones_in_seams_too() -> None:
     rig = load_rig("nuscenes").resized(0.1)
     plan = build_plan(rig, rig.turned(yaw_deg=20), config=RenderConfig(interpolation="nearest", seam_width=0.3))
-    assert any(view.bands for view in plan.targets)
-    assert not any(band.at.frac.any() for view in plan.targets for band in view.bands)
+    assert any(len(view.seam.pixel) for view in plan.targets)
+    assert not any(view.seam.at.frac.any() for view in plan.targets)
     images = noise_images(rig)
     assert differences(by("opencv", plan, images), by("torch", plan, images)).max() <= 1
 
@@ -166,7 +166,7 @@ def test_half_precision_images_keep_float32_positions(dtype: torch.dtype, autoca
     assert all(view.dtype == dtype for view in views)
     assert all(torch.equal(view, other.to(dtype)) for view, other in zip(views, exact, strict=True))
     maps = maps_on(plan, torch.device("cpu"))[0]
-    assert maps.grid.dtype == torch.float32 and (maps.blend is None or maps.blend.grid.dtype == torch.float32)
+    assert maps.grid.dtype == torch.float32 and maps.seam_grid.dtype == torch.float32
     # Half precision would have read other pixels.
     seen = maps.source >= 0
     rows = (maps.grid.bfloat16().float() - maps.grid)[seen][:, 1].abs() * plan.layout.size[0] / 2

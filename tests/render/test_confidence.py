@@ -103,7 +103,7 @@ def test_batches_and_plans(sample: dict) -> None:
         both = retargeted(pair, target, backend=execution)["confidence"]
         assert both.shape == (2, 6, *SIZE)
         torch.testing.assert_close(both[1], retargeted(one, target, backend=execution)["confidence"])
-    plans = [retarget.plan(sample["rig"], target) for retarget in (with_it, without)]
+    plans = [retarget.prepare(sample["rig"]) for retarget in (with_it, without)]
     assert all(t.certainty is None for t in plans[1].targets)
     assert plans[0].nbytes - plans[1].nbytes == 6 * SIZE[0] * SIZE[1]
 

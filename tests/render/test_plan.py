@@ -124,14 +124,14 @@ def test_plans_pickle_and_the_cache_is_bounded() -> None:
 def test_plans_come_back_by_content_and_names() -> None:
     rig = load_rig("nuscenes").resized(0.05)
     retarget = RigRetarget(rig, geometry="street")
-    plan = retarget.plan(rig, rig)
-    assert retarget.plan(replace(rig), replace(rig)) is plan
+    plan = retarget.prepare(rig)
+    assert retarget.prepare(replace(rig)) is plan
     renamed = rig.with_cameras([replace(c, name=c.name + "x") for c in rig])
-    for target in (renamed, replace(rig, name="other"), rig.shifted(x_m=1e-9)):
-        assert retarget.plan(rig, target) is not plan
+    for other in (renamed, replace(rig, name="other"), rig.shifted(x_m=1e-9)):
+        assert retarget.prepare(other) is not plan
 
 
-# --- weights of sources on the nodes, around seams, and the bands that a second source adds to ------------------------
+# --- weights of sources on the nodes ----------------------------------------------------------------------------------
 def test_nodes_weigh_as_the_formulas_say(monkeypatch: pytest.MonkeyPatch) -> None:
     """w = min(2 d / side, 1) * clip(r, 0.05, 1) / (1 + p) * w_primary, by the pinhole model in float64.
 

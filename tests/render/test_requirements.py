@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.requirements import MOVED_M, covers_target_exactly, needs_geometry, static_harm
+from arbiview_aug.render.requirements import MOVED_M, RigPair, covers_target_exactly, static_harm
 from arbiview_aug.render.view_planner import ViewPlanner, build_plan
 from arbiview_aug.transforms.settings import render_config
 
@@ -39,7 +39,7 @@ def surfaces(plan: RenderPlan) -> list[str]:
 def same(one: RenderPlan, two: RenderPlan) -> bool:
     for a, b in zip(one.targets, two.targets, strict=True):
         maps = np.array_equal(a.at.xy, b.at.xy) and np.array_equal(a.at.frac, b.at.frac)
-        if not (maps and np.array_equal(a.source_camera, b.source_camera) and len(a.bands) == len(b.bands)):
+        if not (maps and np.array_equal(a.source_camera, b.source_camera) and len(a.seam.pixel) == len(b.seam.pixel)):
             return False
     return one.layout.size == two.layout.size
 
@@ -131,6 +131,10 @@ def test_two_sources_at_one_centre_share_the_view() -> None:
     assert set(np.unique(plan.targets[0].source_camera)) == {0, 1}
 
 
+def pair(source: Rig, target: Rig, geometry: str = "auto") -> RigPair:
+    return RigPair(source, target.in_frame_of(source), geometry, FAST)
+
+
 def test_geometry_is_needed_where_a_pixel_can_move() -> None:
     rig = nuscenes()
     cut = rig.with_cameras([zoomed(camera, 1.3) for camera in rig])
@@ -147,12 +151,12 @@ def test_geometry_is_needed_where_a_pixel_can_move() -> None:
         (one_centre, one_centre.turned(yaw_deg=30)): False,
     }
     for (source, target), expected in needed.items():
-        assert needs_geometry(source, target, "auto", FAST) == expected, (source.names, target.names)
+        assert pair(source, target).needs_geometry == expected, (source.names, target.names)
     # An option asked for by name is left out only where it cannot matter.
-    assert not needs_geometry(rig, cut, "lidar", FAST)
-    assert needs_geometry(front_and_back, front_and_back.turned(yaw_deg=10), "lidar", FAST)
+    assert not pair(rig, cut, "lidar").needs_geometry
+    assert pair(front_and_back, front_and_back.turned(yaw_deg=10), "lidar").needs_geometry
     nearly = rig.shifted(x_m=1e-5)
-    assert needs_geometry(rig, nearly, "lidar", FAST)
+    assert pair(rig, nearly, "lidar").needs_geometry
 
 
 def test_a_static_surface_harms_where_cameras_move_and_pixels_depend_on_the_street() -> None:

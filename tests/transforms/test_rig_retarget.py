@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch.utils.data import default_collate
 
-from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError, load_rig
+from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.inpaint import Telea
 from arbiview_aug.render.plan import RenderConfig
@@ -521,8 +521,7 @@ def test_copies_and_pickles() -> None:
     sample = sample_of(ring())
     torch.manual_seed(1)
     expected = copy.deepcopy(retarget)(sample)
-    retarget.plan(ring(), ring())
-    assert retarget.plan("nuscenes", "waymo") is retarget.plan(load_rig("nuscenes"), load_rig("waymo"))
+    retarget(sample)
     for other in (copy.deepcopy(retarget), pickle.loads(pickle.dumps(retarget))):
         assert len(other.renderer.plans) == 0
         torch.manual_seed(1)
@@ -591,8 +590,9 @@ def test_frames_without_objects_move_too() -> None:
         ({"match_exposure": torch.zeros(0)}, "match_exposure"),
         ({"keys": {"frame": "source"}}, "keys: expected a SampleKeys, got dict"),
         ({"keys": "confidence"}, "keys: expected a SampleKeys"),
-        ({"cache": 7}, "cache: expected a PlanCache, got int"),
-        ({"cache": {"max_bytes": 3}}, "cache: expected a PlanCache"),
+        ({"cache_bytes": -1}, "cache_bytes: expected a number of bytes from 0, got -1"),
+        ({"cache_bytes": "1 GB"}, "cache_bytes: expected"),
+        ({"cache_bytes": None}, "cache_bytes: expected"),
         ({"quality": "paper", "keys": SampleKeys(extra=("confidence",))}, "extra: quality='paper' has no 'confidence'"),
         ({"backend": "jax"}, "backend: expected one of auto, opencv, torch, got 'jax'"),
         ({"p": 1.5}, "p: expected a probability from 0 to 1, got 1.5"),
