@@ -189,17 +189,17 @@ def joined(maps: Iterable[DepthMap]) -> list[DepthMap]:
 # --- points -----------------------------------------------------------------------------------------------------------
 def points_of(maps: Iterable[DepthMap]) -> Layer:
     """The maps' points (P, 3) in the ego frame, map after map and row after row."""
-    parts = [np.zeros((0, 3), np.float32)]
+    parts = [np.zeros((3, 0), np.float32)]
     for camera, depth_m in maps:
         rays, depth = _rays_to_depth_1(camera), depth_m.reshape(-1)
-        known = np.flatnonzero((depth > 0) & np.isfinite(rays[:, 0]))
-        parts.append(np.take(rays, known, axis=0) * depth[known, None] + camera.center_m.astype(np.float32))
-    return np.concatenate(parts)
+        points = rays * depth + camera.center_m.astype(np.float32)[:, None]
+        parts.append(points.compress((depth > 0) & np.isfinite(rays[0]), axis=1))
+    return np.ascontiguousarray(np.concatenate(parts, axis=1).T)
 
 
 @lru_cache(16)  # the cameras of a rig serve every frame
 def _rays_to_depth_1(camera: Camera) -> Layer:
-    """Ego-frame vectors (h w, 3) from a camera's centre to where its pixels have depth 1; NaN where they look aside."""
+    """Ego-frame vectors (3, h w) from a camera's centre to where its pixels have depth 1; NaN where they look aside."""
     rays = pixel_rays(camera).at(*map(np.arange, camera.size)).reshape(3, -1)
     ahead = np.where(rays[2] > _LEAST_Z, rays[2], np.float32(np.nan))
-    return np.ascontiguousarray((camera.cam2ego[:3, :3].astype(np.float32) @ (rays / ahead)).T)
+    return np.asarray(camera.cam2ego[:3, :3].astype(np.float32) @ (rays / ahead))
