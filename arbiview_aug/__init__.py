@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.training import depth_maps as depth_maps
     from arbiview_aug.transforms.rig_retarget import RigRetarget as RigRetarget
     from arbiview_aug.transforms.scans import retarget_points as retarget_points
+    from arbiview_aug.transforms.settings import PlanCache as PlanCache
     from arbiview_aug.transforms.settings import SampleKeys as SampleKeys
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

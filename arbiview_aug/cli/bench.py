@@ -26,6 +26,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from tqdm import tqdm
 
+from arbiview_aug import PlanCache
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import REAL_TARGET, writable_folder
@@ -155,7 +156,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         row |= {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
         rows.append(row | {"harm": static_harm(source, target, setting.surface, RenderConfig())})
         options: dict[str, Any] = {"quality": setting.quality, "geometry": setting.surface, "holes": "black"}
-        retarget = RigRetarget(target, cache_bytes=0, **options)  # keeps the last plan alone
+        retarget = RigRetarget(target, cache=PlanCache(max_bytes=0), **options)  # keeps the last plan alone
         calls[setting.name] = partial(retarget, frames[0].lidar["even"].sample if by_points else first)
     for reduce in reduces:
         data = open_data(arguments.data, reduce=reduce, load_points=False)

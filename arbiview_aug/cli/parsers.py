@@ -53,6 +53,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         ("--num-shards", count, "N", 1, "number of shards"),
         ("--runner", ("local", "ray"), None, "local", "processes here, or Ray actors"),
         ("--on-error", ("report", "skip"), None, "report", "bad samples: do not finish (default), or leave them out"),
+        ("--report", seed, "N", 0, "frames to score and show in conversion/report.html of the output (default: 0)"),
         # demo, depth, evaluate, train
         ("--width", count, "PX", 1800, "width of the contact sheet"),
         ("--model", path, "ID_OR_PATH", None, "depth model of transformers: a folder, or a name on its Hub"),
@@ -176,7 +177,7 @@ COMMANDS = {
             (f"--version --names {_RENDERING} --generator", {}),
             ("--size", {"help": "height and width of every view (default: the target's own)"}),
             (f"--fit --points {_READING} --neighbours --depth --images --shard-index --num-shards", {}),
-            ("--runner --workers --on-error", {}),
+            ("--runner --workers --on-error --report", {}),
         ],
         resumable=True,
     ),

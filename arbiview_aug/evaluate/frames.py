@@ -30,7 +30,7 @@ from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.boxes_2d import rig_of
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from arbiview_aug.transforms.settings import SampleKeys, inpainter_of, render_config
+from arbiview_aug.transforms.settings import PlanCache, SampleKeys, inpainter_of, render_config
 
 Sample = Mapping[str, Any]
 
@@ -64,7 +64,7 @@ def retargeting(
 ) -> Method:
     """Wrap ``RigRetarget`` as a method, with its arguments; exposures stay as recorded, for the metrics."""
     inpainter = inpainter_of(holes)  # once, not for each target
-    settings = dict[str, Any](cache_bytes=0) | settings
+    settings = dict[str, Any](cache=PlanCache(max_bytes=0)) | settings
     images_alone = replace(settings.get("keys", SampleKeys()), points="source")
     settings |= {"holes": inpainter, "match_exposure": False, "keys": images_alone}
 

@@ -46,8 +46,8 @@ from arbiview_aug.transforms.renderers import (
     RendererSettings,
 )
 from arbiview_aug.transforms.settings import (
+    PlanCache,
     SampleKeys,
-    checked_bytes,
     checked_instance,
     checked_params,
     checked_pixels,
@@ -117,8 +117,7 @@ class RigRetarget(torch.nn.Module):
             ``p < 1`` needs ``size`` and equal camera counts (else see ``MixedDataset``). Each call draws again; calls
             of one sequence share the draw with a ``RandomRig(per="sequence")``.
         keys: Label maps, further outputs and frames: ``SampleKeys``.
-        cache_bytes: Memory for plans of calibrations that come back; the least recently used go first. Pickles and
-            copies hold none: each DataLoader worker fills its own.
+        cache: Limit of the plans kept from call to call.
         backend: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
 
@@ -150,7 +149,7 @@ class RigRetarget(torch.nn.Module):
         fit: Fit = "crop",
         p: float = 1.0,
         keys: SampleKeys = SampleKeys(),  # noqa: B008 - frozen
-        cache_bytes: int = 512 * 2**20,
+        cache: PlanCache = PlanCache(),  # noqa: B008 - frozen
         backend: Backend = "auto",
     ) -> None:
         super().__init__()
@@ -163,7 +162,7 @@ class RigRetarget(torch.nn.Module):
         if self.p < 1 and size is None:
             raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
         self.size = None if size is None else checked_pixels(size)
-        self.keys, self.cache_bytes = checked_instance("keys", keys, SampleKeys), checked_bytes(cache_bytes)
+        self.keys, self.cache = checked_instance("keys", keys, SampleKeys), checked_instance("cache", cache, PlanCache)
         refuse_camera_values(self.keys.labels)
         self.inpainter = inpainter_of(holes)  # moves with this module
         self._warn, self._checked = WarnOnce(), set[frozenset[Any]]()  # keys and types of samples that were checked
@@ -186,7 +185,7 @@ class RigRetarget(torch.nn.Module):
             reach=self.neighbours,
             match_exposure=exposure,
             backend=choice("backend", backend, get_args(Backend)),
-            cache_bytes=self.cache_bytes if is_reused else 0,
+            cache_bytes=self.cache.max_bytes if is_reused else 0,
             outputs=self.keys.extra,
             inpainter=self.inpainter,
             p=self.p,

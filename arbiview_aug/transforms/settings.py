@@ -71,6 +71,21 @@ class SampleKeys:
             choice(f"SampleKeys.{name}", getattr(self, name), ("source", "target"))
 
 
+@dataclass(frozen=True)
+class PlanCache:
+    """Plans of calibrations that come back. Pickles and copies are empty: each DataLoader worker fills its own.
+
+    Attributes:
+        max_bytes: Memory for these plans; the least recently used go first. ValueError if it is no number from 0.
+    """
+
+    max_bytes: int = 512 * 2**20
+
+    def __post_init__(self) -> None:
+        if not is_number(self.max_bytes) or not self.max_bytes >= 0:
+            raise ValueError(f"PlanCache.max_bytes: expected a number of bytes from 0, got {shown(self.max_bytes)}")
+
+
 def render_config(quality: Any) -> Any:
     """A preset by its name, or the ``RenderConfig`` or ``PaperConfig`` itself; ValueError for anything else."""
     if isinstance(quality, str) and quality in (*PRESETS, "paper"):
@@ -110,13 +125,6 @@ def checked_instance(name: str, value: Any, kind: type[T]) -> T:
     """Return ``value`` if it is an instance of ``kind``; ValueError for anything else."""
     if not isinstance(value, kind):
         raise ValueError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
-    return value
-
-
-def checked_bytes(value: Any) -> int:
-    """A number of bytes from 0; ValueError for anything else."""
-    if not is_number(value) or not value >= 0:
-        raise ValueError(f"cache_bytes: expected a number of bytes from 0, got {shown(value)}")
     return value
 
 

@@ -36,6 +36,7 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
+from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
@@ -343,7 +344,7 @@ def _held(sample: Sample, target: Rig, **settings: Any) -> Callable[[], Any]:
 
 def _anew(sample: Sample, target: Rig, surface: GeometryName, **settings: Any) -> Callable[[], Any]:
     """Call with the rig, over the street, always a little elsewhere; plans over a frame's geometry never come back."""
-    retarget = RigRetarget(target, geometry=surface, cache_bytes=0, **_PLAIN | settings)
+    retarget = RigRetarget(target, geometry=surface, cache=PlanCache(max_bytes=0), **_PLAIN | settings)
     rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(_STEPS if surface == "street" else 1)])
     return lambda: retarget({**sample, "rig": next(rigs)})
 

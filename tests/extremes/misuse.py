@@ -149,7 +149,7 @@ def settings(draw: st.DrawFn, keys: Collection[str]) -> dict[str, Any]:
 
 SETTING_NAMES = (
     *("source", "geometry", "holes", "quality", "neighbours", "match_exposure"),
-    *("size", "fit", "p", "keys", "cache_bytes", "backend"),
+    *("size", "fit", "p", "keys", "cache", "backend"),
 )
 
 SETTING_JUNK: tuple[Callable[[], Any], ...] = (

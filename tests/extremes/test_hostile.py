@@ -27,7 +27,7 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
-from arbiview_aug import ArbiviewError, Camera, PaperConfig, RandomRig, RenderConfig, RigRetarget, load_rig
+from arbiview_aug import ArbiviewError, Camera, PaperConfig, PlanCache, RandomRig, RenderConfig, RigRetarget, load_rig
 from arbiview_aug import check as find_mistakes
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder, Neighbours
@@ -217,6 +217,7 @@ def test_samples_that_hold_themselves() -> None:
 HUGE = np.array([[1e308, -1e308, 0, 0], [1e308, 1e308, 0, 0], [0, 0, 1e308, 0], [0, 0, 0, 1]])
 REFUSED: tuple[tuple[Callable[[], object], str], ...] = (
     (lambda: Camera(name="c", width_px=9, height_px=7, K=np.eye(3), cam2ego=HUGE), "nearest rotation"),
+    (lambda: PlanCache(max_bytes=None), r"PlanCache\.max_bytes"),  # type: ignore[arg-type]
     (lambda: RenderConfig(seam_width="a"), r"RenderConfig\.seam_width"),  # type: ignore[arg-type]
     (lambda: RenderConfig(seam_width=10**400), r"RenderConfig\.seam_width"),
     (lambda: RenderConfig(antialias="no"), r"RenderConfig\.antialias: expected True or False"),  # type: ignore[arg-type]
@@ -274,21 +275,25 @@ def test_memory_comes_back_while_its_lock_is_held() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"cache_bytes": 2**30},
-        {"cache_bytes": 20_000},  # plans are dropped all the time
-        pytest.param({"match_exposure": True, "quality": "accurate", "cache_bytes": 1}, marks=pytest.mark.slow),
+        {"cache": PlanCache(max_bytes=2**30)},
+        {"cache": PlanCache(max_bytes=20_000)},  # plans are dropped all the time
+        pytest.param(
+            {"match_exposure": True, "quality": "accurate", "cache": PlanCache(max_bytes=1)}, marks=pytest.mark.slow
+        ),
     ],
 )
 def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:
     retarget = RigRetarget(misuse.rig().shifted(z_m=0.2), geometry="street", **settings)
     count = 70 if "quality" not in settings else 20
-    fresh = RigRetarget(misuse.rig().shifted(z_m=0.2), geometry="street", **{**settings, "cache_bytes": 2**29})
+    fresh = RigRetarget(
+        misuse.rig().shifted(z_m=0.2), geometry="street", **{**settings, "cache": PlanCache(max_bytes=2**29)}
+    )
     with ThreadPoolExecutor(4) as threads:
         rendered = list(threads.map(lambda k: retarget(moving(k % 35))["images"], range(count)))
     for k, images in enumerate(rendered):
         assert torch.equal(images, fresh(moving(k % 35))["images"])
     assert retarget.renderer.plans.misses <= count
-    assert retarget.renderer.plans.size <= retarget.cache_bytes or len(retarget.renderer.plans) == 1
+    assert retarget.renderer.plans.size <= retarget.cache.max_bytes or len(retarget.renderer.plans) == 1
 
 
 def test_files_that_mutations_found(boundaries: Boundaries) -> None:

@@ -6,19 +6,25 @@ import argparse
 import pickle
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from arbiview_aug.atomic_io import remove_parts
-from arbiview_aug.cli.arguments import told_once, writable_folder
+from arbiview_aug.atomic_io import remove_parts, write_whole
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.arguments import chosen_frames, gathered_warnings, told_once, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State
 from arbiview_aug.cli.convert.writer import Settings
 from arbiview_aug.cli.parallel import results, with_progress
-from arbiview_aug.datasets.drive import is_converted
+from arbiview_aug.datasets.drive import CONVERSION_FOLDER, Recording, is_converted
+from arbiview_aug.datasets.registry import kinds_of, open_data
 from arbiview_aug.environment import one_thread, optional_package, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
+from arbiview_aug.evaluate.frames import Method, evaluate, make_frame
+from arbiview_aug.evaluate.metrics import RenderedView, as_arrays
+from arbiview_aug.evaluate.report.tables import evaluation_table, html_report
 from arbiview_aug.transforms.warm_up import compile_kernels
 
 
@@ -76,6 +82,8 @@ def run(arguments: argparse.Namespace) -> int:
     _print_notes(notes)
     jobs.manifest.finish(facts, data.tokens, written)
     print(f"look at it: python -m arbiview_aug check {settings.output}")
+    if arguments.report:
+        print(f"report: {write_report(settings, data, converted, arguments.report)}")
     return 0
 
 
@@ -125,3 +133,28 @@ def ray_results(jobs: Jobs, workers: int) -> Iterator[Done]:
     share = {"num_cpus": 1, "num_gpus": min(1.0, gpus / workers)}
     done = rows.map(Actor, fn_constructor_args=(jobs,), compute=data.ActorPoolStrategy(size=workers), **share)
     return (pickle.loads(row["done"]) for row in done.iter_rows())
+
+
+def write_report(settings: Settings, data: Recording, tokens: Sequence[str], count: int) -> Path:
+    """Score ``count`` converted frames, spread evenly over ``tokens``, as ``evaluate`` does; return the page's path."""
+    picked = [tokens[k] for k in chosen_frames(count, len(tokens))]
+    version = settings.options.version
+    is_kept = settings.kind in kinds_of(settings.output)  # logs become frame folders; tables may have any name
+    kind = "nuscenes" if version else settings.kind if is_kept else None
+    written = open_data(settings.output, kind=kind, version=version, load_points=False)
+
+    def read_views(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
+        stored = written.by_token(sample["token"])
+        views = map(RenderedView, as_arrays(stored["images"]), map(np.asarray, stored["coverage"]))
+        by_name = dict(zip(stored["rig"].names, views, strict=True))  # in the reader's order
+        return [by_name[name] for name in rig.names]
+
+    # The views were rendered at the recorded exposures.
+    frames = ((token, make_frame(data.by_token(token), exposures=("raw",))) for token in picked)
+    with gathered_warnings([]):  # printed already during conversion
+        done = evaluate(frames, lambda _: settings.sized_target, [Method("converted", read_views)])
+    title = f"{data.root.resolve().name} as {settings.target.name or 'the target'} would have seen it"
+    notes = [f"{len(picked)} of {len(tokens)} frames. LiDAR points also score views that were made with them."]
+    page = html_report(title, done, ["converted"], [evaluation_table(done, ["converted"])], notes)
+    write_whole({(path := settings.output / CONVERSION_FOLDER / "report.html"): page.encode()})
+    return path

@@ -37,7 +37,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def output(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("converted") / "new"
-    assert main(command(source, folder, "--images", "png", "--target", "waymo")) == 0  # with lenses
+    assert main(command(source, folder, "--images", "png", "--report", "1", "--target", "waymo")) == 0  # with lenses
     return folder
 
 
@@ -143,6 +143,11 @@ def test_provenance_names_versions_settings_and_sources(source: Path, output: Pa
     for name, digest in sums.items():
         assert hashlib.sha256((source / name).read_bytes()).hexdigest() == digest
     assert said["skipped"] == {}
+
+
+def test_a_report_shows_what_was_written(output: Path) -> None:
+    page = (output / "conversion" / "report.html").read_text()
+    assert "drive as waymo would have seen it" in page and "1 of 3 frames" in page and "converted" in page
 
 
 def test_fits_and_bars(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
