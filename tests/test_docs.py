@@ -56,7 +56,7 @@ TINY = {
     "inspect nuscenes waymo --output docs/images/rigs.jpg": [],
     "inspect nuscenes truck.yaml": [],
     "bench --data FOLDER": [*TINY_BENCH, "--geometry", "infinity", "lidar"],
-    "convert --data FOLDER --target argoverse2 --output converted --size 256x704": [
+    "convert --data FOLDER --target argoverse2 --output converted --size 512x704": [
         *("--size", "24x40", "--downscale", "4", "--workers", "1", "--geometry", "street")
     ],
     "depth --data FOLDER": ["--output", "depth"],

@@ -64,7 +64,9 @@ def run(arguments: argparse.Namespace) -> None:
     title, rows, columns, table_notes = evaluation_table(done, [method.name for method in methods])
     count_of = frames_text(min(arguments.frames, len(data)))
     print(text_table(f"{title} ({len(target)} cameras, {count_of})", rows, columns, table_notes))
-    planned = f"{other_ms:.1f} ms with another calibration or other boxes, whose plan is new."
+    is_kept = len(retarget.renderer.plans) > 0
+    new = "whose plan is new" if is_kept else "and every frame is planned: its objects move"
+    planned = f"{other_ms:.1f} ms with another calibration, {new}."
     planned = "nothing can be planned ahead." if is_paper else planned
     sizes = f"{len(source)} source images to {len(target)} views of {target[0].height_px}x{target[0].width_px}"
     print(f"\n{same_ms:.1f} ms a frame: {sizes}, quality {quality}, {cv2.getNumThreads()} threads; {planned}")

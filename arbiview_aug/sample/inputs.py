@@ -134,7 +134,10 @@ def _entries(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
     if key in _OF_CAMERAS:
         return split(key, value, lead)
     if key == "lens":
-        names = np.array(value, dtype=object)  # ``default_collate`` makes lists of a batch's names
+        try:
+            names = np.array(value, dtype=object)  # ``default_collate`` makes lists of a batch's names
+        except (TypeError, ValueError, RuntimeError):  # tensors that numpy cannot hold
+            return [value] * count
         return names.reshape(-1, count).T.tolist() if lead and names.shape[1:] == lead else [value] * count
     if key in _ARRAYS:
         value = numbers(key, value)

@@ -6,8 +6,6 @@ import operator
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-import numpy as np
-
 from arbiview_aug import favs
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
@@ -156,8 +154,9 @@ def checked_pixels(value: Any) -> tuple[int, int]:
     return h, w
 
 
-_LEAST_KEPT, _LEAST_ROWS = 0.5, 0.4
-"""Shares of a view below which a size is probably a mistake. Rows may be fewer: detectors cut the sky."""
+_LEAST_KEPT = 0.5
+"""Share of a view below which a size is probably a mistake. Rows may be fewer, down to the horizon: detectors cut the
+sky."""
 
 
 def size_mistake(rig: Rig, size: tuple[int, int], fit: Fit) -> str | None:
@@ -172,7 +171,7 @@ def size_mistake(rig: Rig, size: tuple[int, int], fit: Fit) -> str | None:
 
 
 def _lost(camera: Camera, size: tuple[int, int], fit: Fit) -> str:
-    """Loss of a camera whose view keeps less than ``_LEAST_KEPT``; empty otherwise."""
+    """Loss of a camera whose view keeps less than ``_LEAST_KEPT``, or not its optical axis; empty otherwise."""
     ratio = size[0] * camera.width_px / (size[1] * camera.height_px)
     share = min(ratio, 1 / ratio)
     if share >= _LEAST_KEPT:
@@ -180,12 +179,13 @@ def _lost(camera: Camera, size: tuple[int, int], fit: Fit) -> str:
     if fit != "crop":
         how = f"are squeezed to {share:.0%} along one side" if fit == "stretch" else f"fill {share:.0%} of the view"
         return f"images of {camera.name!r} {how}"
-    # By the outer edges' angles, which a lens may crowd together.
-    fov, kept = (np.array(c.fov_deg) for c in (camera, camera.resize(size, fit)))
-    side = int((kept / fov).argmin())
-    if kept[side] >= (_LEAST_KEPT, _LEAST_ROWS)[side] * fov[side]:
+    cropped = camera.resize(size, fit)
+    if cropped.K[1, 2] < 0 <= camera.K[1, 2]:
+        return f"{camera.name!r} loses its horizon, {-cropped.K[1, 2]:.0f} rows above the view"
+    fov_deg, kept_deg = camera.fov_deg[0], cropped.fov_deg[0]  # of the outer edges, which a lens may crowd together
+    if kept_deg >= _LEAST_KEPT * fov_deg:
         return ""
-    return f"{camera.name!r} keeps {kept[side]:.0f} of its {fov[side]:.0f} degrees {('across', 'up and down')[side]}"
+    return f"{camera.name!r} keeps {kept_deg:.0f} of its {fov_deg:.0f} degrees across"
 
 
 def warn_of_target(target: Rig, warn: WarnOnce) -> None:

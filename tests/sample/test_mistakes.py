@@ -236,8 +236,8 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "one camera with a body's axes": (second_camera(lambda pose: pose @ BODY.T), "camera .*: cam2ego: .*ROS.*right$"),
     "one camera with OpenGL's axes": (second_camera(lambda pose: pose @ OPENGL), "camera .*: cam2ego: .*OpenGL.*; neg"),
     "one camera rolled": (second_camera(turn(lambda R: R @ rotation_z(120))), "camera .*: cam2ego: .*rolled by -1[12]"),
-    "one quaternion x y z w": (quaternion_misread([1, 2, 3, 0]), "camera .*: cam2ego: .*x y z w read as w x y z"),
-    "one quaternion w x y z": (quaternion_misread([3, 0, 1, 2]), "camera .*: cam2ego: .*w x y z read as x y z w"),
+    "one quaternion x y z w": (quaternion_misread([1, 2, 3, 0]), "camera .*: cam2ego: .*a quaternion in another order"),
+    "one quaternion w x y z": (quaternion_misread([3, 0, 1, 2]), "camera .*: cam2ego: .*a quaternion in another order"),
     "left-handed positions": (
         poses(lambda pose: pose * np.array([1.0, 1, 1, -1]) ** np.array([[0], [1], [0], [0]])),
         r"cam2ego: .*mirrored; positions are left-handed.*negate cam2ego\[1, 3\]",

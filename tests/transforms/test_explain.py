@@ -106,7 +106,11 @@ SIZES: list[tuple[tuple[int, int], str, str]] = [
     ((704, 256), "crop", r"keeps 1\d of its 6\d degrees across; size is \(h, w\): did you mean \(256, 704\)"),
     ((704, 256), "stretch", "squeezed to 20% along one side; size is .* did you mean"),
     ((704, 256), "pad", "fill 20% of the view; size is .* did you mean"),
-    ((128, 704), "crop", "degrees up and down; choose a size of the images' shape, or 'pad' or 'stretch'"),
+    (
+        (128, 704),
+        "crop",
+        "loses its horizon, 70 rows above the view; choose a size of the images' shape, or 'pad' or 'stretch'",
+    ),
 ]
 
 
@@ -122,7 +126,12 @@ def test_usual_sizes_are_silent() -> None:
         warnings.simplefilter("error")
         for size in ((256, 704), (512, 1408), (320, 800), (256, 256), (900, 1600)):
             RigRetarget(LANDSCAPE, size=size)
-        RigRetarget("argoverse2", size=(256, 704))  # one camera of seven is upright
+        RigRetarget("argoverse2", size=(512, 704))  # one camera of seven is upright
+
+
+def test_a_size_that_cuts_the_horizon_away() -> None:
+    with pytest.warns(GeometryWarning, match="'ring_front_center' loses its horizon, 214 rows above the view; choose"):
+        RigRetarget("argoverse2", size=(256, 704))
 
 
 TARGETS: dict[str, tuple[Callable[[Rig], Rig], str]] = {
