@@ -50,8 +50,7 @@ def match_walls(
 
     ``rays`` (3, h, w) are in the neighbour's frame, where they start at ``offset`` (3,); for a pinhole both are times
     its intrinsics. ``road``, ``horizontal`` and ``windows`` are of a ``SweptImage``. ``walls`` (K,) are 1/radius,
-    ascending; ``lens`` is the neighbour's code, its ``Camera.parameters``, and positions (K, 2, h, w) for a negative
-    code; ``quads`` (H, W) are those of its image.
+    ascending; ``lens`` is the neighbour's code and its ``Camera.parameters``; ``quads`` (H, W) are those of its image.
     """
     h, w = road.shape
     surface, lines, sums = (rays, road, horizontal), np.empty((7, w), np.float32), np.empty((3, w + _WIDER), np.int32)
@@ -67,7 +66,7 @@ def match_walls(
         while k and rows and walls[k] < touching[rows - 1]:  # as over the wall before
             rows -= 1
         rows = min(rows + RADIUS_PX, h)
-        _read(surface, walls[k], offset, lens, k, quads, rows, lines, read, seen)
+        _read(surface, walls[k], offset, lens, quads, rows, lines, read, seen)
         _correlate(read, seen, windows, sums, rows, k, costs)
         for y in range(rows, h):
             for x in range(w):
@@ -109,7 +108,7 @@ def _seven(line: Any, x: Any) -> Any:
 
 @called
 def _read(
-    surface: Any, wall: Any, offset: Any, lens: Any, k: Any, quads: Any, rows: Any, lines: Any, read: Any, seen: Any
+    surface: Any, wall: Any, offset: Any, lens: Any, quads: Any, rows: Any, lines: Any, read: Any, seen: Any
 ) -> None:
     """Read the first ``rows``, and a window below them, of a neighbour's image as over a surface.
 
@@ -122,11 +121,7 @@ def _read(
     at, words = np.empty(w, np.int32), np.empty(w, np.int64)
     halves = words.view(np.int32)
     for y in range(min(rows + RADIUS_PX, h)):
-        if lens[0] < 0:
-            for x in range(n):
-                u[x], v[x] = lens[2][k, 0, y, x], lens[2][k, 1, y, x]
-        else:
-            _project_row(surface, y, wall, offset, lens, lines)
+        _project_row(surface, y, wall, offset, lens, lines)
         for x in range(n):
             column, row = min(u[x] if u[x] > _ZERO else _ZERO, last_x), min(v[x] if v[x] > _ZERO else _ZERO, last_y)
             at[x] = np.int32(np.int32(np.int32(row) * width) + np.int32(column))

@@ -140,12 +140,9 @@ class SweptImage:
         from arbiview_aug.temporal.kernels import match_walls
 
         h, w = self.camera.size
-        kind, positions = LENS_CODES.get(other.camera.lens, -1), np.zeros((0, 2, h, w), np.float32)
-        if kind < 0:
-            positions = np.stack([self.positions(other.camera, self.inverse_distance(wall)) for wall in walls])
         A, offset = (part.astype(np.float32) for part in between(self.camera, other.camera))
-        lens = kind, other.camera.parameters, positions
-        if kind == 0:
+        lens = LENS_CODES[other.camera.lens], other.camera.parameters
+        if other.camera.lens == "pinhole":
             K = other.camera.K.astype(np.float32)
             A, offset = K @ A, K @ offset
         rays = (A @ self.rays.reshape(3, -1)).reshape(3, h, w)

@@ -188,7 +188,7 @@ def cast_rays(scene: Scene, origin: FloatArray, street: Rays) -> tuple[FloatArra
         directions = torch.as_tensor(packets).transpose(1, 2).contiguous()
         local = scene_from(scene, origin)
         start = torch.as_tensor(origin[None].astype(np.float32))
-        distance, hit = cast(local, start, directions, find_candidates(local, directions))
+        distance, hit = cast(local, start, directions, *find_candidates(local, directions))
     t, row = (a.numpy().ravel()[: columns * m] for a in (distance.double(), hit))  # without the padding
     return t, row
 
@@ -229,9 +229,7 @@ def demo_target_rig(size: tuple[int, int] = (256, 704)) -> Rig:
     return _ring((("front", 0.0, 65.0, 1.5, 0.0), left, right, *sides), 2.1, size, "van")
 
 
-def _ring(
-    layout: Sequence[tuple[str, float, float, float, float]], height_m: float, size: tuple[int, int], name: str
-) -> Rig:
+def _ring(layout: Sequence[tuple[Any, ...]], height_m: float, size: tuple[int, int], name: str) -> Rig:
     """A rig of cameras by name, azimuth and field of view (degrees), x and y (metres)."""
     looking = partial(Camera.looking, width_px=size[1], height_px=size[0])
     cameras = [

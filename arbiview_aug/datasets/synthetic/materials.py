@@ -108,7 +108,7 @@ class Surface(NamedTuple):
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """(n,) dot products of (n, 3) vectors, in a fixed order of summation."""
+    """(n, ...) dot products along the second of dimensions (n, 3, ...), in a fixed order of summation."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 

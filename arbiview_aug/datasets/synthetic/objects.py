@@ -12,8 +12,6 @@ import numpy as np
 
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Look, Material, Range, SceneBuilder, SceneClass, Vector
 
-Color = Vector
-
 # Length, width and height in metres: published sizes of production vehicles, from small cars to city buses.
 VEHICLE_SIZES: dict[BoxClass, tuple[Range, Range, Range]] = {
     BoxClass.CAR: ((3.6, 4.95), (1.66, 1.95), (1.40, 1.80)),
@@ -21,33 +19,33 @@ VEHICLE_SIZES: dict[BoxClass, tuple[Range, Range, Range]] = {
     BoxClass.TRUCK: ((6.2, 9.0), (2.20, 2.50), (2.80, 3.60)),
     BoxClass.BUS: ((9.0, 12.0), (2.50, 2.55), (2.95, 3.40)),
 }
-PAINTS: tuple[Color, ...] = (
+PAINTS: tuple[Vector, ...] = (
     (0.85, 0.85, 0.86), (0.80, 0.81, 0.83), (0.62, 0.64, 0.66), (0.40, 0.42, 0.44), (0.16, 0.17, 0.19),
     (0.10, 0.10, 0.12), (0.55, 0.10, 0.10), (0.12, 0.20, 0.42), (0.18, 0.32, 0.24), (0.72, 0.58, 0.22),
     (0.45, 0.36, 0.28), (0.30, 0.44, 0.58),
 )  # fmt: skip
-_CLOTHES: tuple[Color, ...] = (
+_CLOTHES: tuple[Vector, ...] = (
     (0.15, 0.17, 0.25), (0.55, 0.14, 0.16), (0.78, 0.77, 0.72), (0.20, 0.35, 0.50), (0.70, 0.55, 0.15),
     (0.12, 0.12, 0.13), (0.35, 0.45, 0.30), (0.60, 0.40, 0.50),
 )  # fmt: skip
-_TROUSERS: tuple[Color, ...] = (
+_TROUSERS: tuple[Vector, ...] = (
     (0.13, 0.17, 0.28), (0.10, 0.10, 0.11), (0.38, 0.33, 0.26), (0.28, 0.29, 0.31), (0.20, 0.16, 0.14)
 )  # fmt: skip
-WALLS: tuple[Color, ...] = (
+WALLS: tuple[Vector, ...] = (
     (0.62, 0.55, 0.46), (0.55, 0.33, 0.26), (0.70, 0.68, 0.63), (0.48, 0.47, 0.46), (0.66, 0.60, 0.42),
     (0.40, 0.30, 0.26), (0.58, 0.62, 0.64), (0.74, 0.66, 0.58), (0.36, 0.38, 0.42),
 )  # fmt: skip
-TIRE: Color = (0.09, 0.09, 0.095)
-DARK: Color = (0.11, 0.11, 0.12)
+TIRE: Vector = (0.09, 0.09, 0.095)
+DARK: Vector = (0.11, 0.11, 0.12)
 
 
-def pick(rng: np.random.Generator, colors: tuple[Color, ...], spread: float = 0.05) -> Color:
+def pick(rng: np.random.Generator, colors: tuple[Vector, ...], spread: float = 0.05) -> Vector:
     """One of the colours, a little off: brightness varies more than hue."""
     base = np.array(colors[int(rng.integers(len(colors)))]) + rng.normal(0, spread) + rng.normal(0, spread / 4, 3)
     return tuple(float(c) for c in base.clip(0.05, 0.92))  # type: ignore[return-value]
 
 
-def plain(color: Color) -> Look:
+def plain(color: Vector) -> Look:
     """One colour without a pattern."""
     return Look(Material.PLAIN, color)
 
@@ -94,7 +92,7 @@ def add_pedestrian(builder: SceneBuilder, xyz: Vector, yaw: float) -> None:
     place = builder.place(SceneClass.PEDESTRIAN, xyz, yaw, (BoxClass.PEDESTRIAN, (length, width, height)))
     trousers, jacket = pick(rng, _TROUSERS), pick(rng, _CLOTHES)
     skin = pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
-    sleeve: Color = (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85)
+    sleeve: Vector = (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85)
     hip, shoulder = 0.48 * height, 0.83 * height
     stride = length / 2 - 0.075
     for side in (-1, 1):
@@ -159,11 +157,10 @@ def add_building(builder: SceneBuilder, x: Range, y: Range, z: Range, *, detaile
         cloth = pick(rng, _CLOTHES)
         a = rng.uniform(x[0] + 0.3, (x[0] + x[1]) / 2)
         b = min(a + rng.uniform(3, 7), x[1] - 0.2)
-        ends = sorted((front, front + outward * rng.uniform(0.8, 1.3)))
-        place.box((a, b), (ends[0], ends[1]), (2.75, 3.0), Look(Material.ROUGH, cloth, (0.4, 0.1, 0, 0)))
+        reach = front, front + outward * rng.uniform(0.8, 1.3)
+        place.box((a, b), reach, (2.75, 3.0), Look(Material.ROUGH, cloth, (0.4, 0.1, 0, 0)))
     if height > 9 and rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 3))):
             a = rng.uniform(x[0] + 0.5, max(x[0] + 0.6, x[1] - 3.5))
-            ends = sorted((front, front + outward * 0.7))
-            bounds = (a, min(a + 2.6, x[1])), (ends[0], ends[1]), (storey, height * 0.85)
+            bounds = (a, min(a + 2.6, x[1])), (front, front + outward * 0.7), (storey, height * 0.85)
             place.box(*bounds, Look(Material.FACADE, wall, (2.6, storey, 0.7, 0.0)))

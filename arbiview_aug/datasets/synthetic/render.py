@@ -20,9 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.datasets.synthetic.materials import dot
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, GROUND_ID, SKY_ID, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.shading import CHUNK, Hits, SceneTables, faces, lit, sky, tables_of
 from arbiview_aug.environment import one_thread
@@ -33,9 +35,6 @@ _THIN_PX = 1.5  # primitives thinner than this are supersampled
 _BATCH_PX = 1_500_000  # most pixels shaded together, with 150 MB of intermediate results
 _CACHED_BYTES = 512 << 20  # of rays that are kept: six cameras of 1600x900 have 350 MB
 _MIN_COS = 0.2  # packets with a ray further than 78 degrees off their axis have no pyramid: all are candidates
-
-
-Candidates = tuple[Tensor, Tensor]  # [C] rows of packets, [C] of primitives that they may hit
 
 
 class LocalScene(NamedTuple):
@@ -83,23 +82,18 @@ def pyramids(rays: Tensor) -> Tensor:
     u = torch.linalg.cross(up, axis)
     u = u / u.norm(dim=1, keepdim=True)
     v = torch.linalg.cross(axis, u)
-    along = _dot(axis, rays)  # [n, R]
+    along = dot(axis[..., None], rays)  # [n, R]
     narrow = along.amin(1) > _MIN_COS
     along = along.clamp_min(_MIN_COS)
     sides = []
     for side in (u, v):
-        tangent = _dot(side, rays) / along
+        tangent = dot(side[..., None], rays) / along
         sides += [side - (tangent.amin(1) - 1e-4)[:, None] * axis, (tangent.amax(1) + 1e-4)[:, None] * axis - side]
     return torch.where(narrow[:, None, None], torch.stack(sides, 1), 0.0)
 
 
-def _dot(a: Tensor, rays: Tensor) -> Tensor:
-    """(n, 3) with (n, 3, R) to (n, R)."""
-    return a[:, 0:1] * rays[:, 0] + a[:, 1:2] * rays[:, 1] + a[:, 2:3] * rays[:, 2]
-
-
-def find_candidates(local: LocalScene, rays: Tensor) -> Candidates:
-    """Primitives whose hull may reach into packets' pyramids, sorted by packet, then by distance."""
+def find_candidates(local: LocalScene, rays: Tensor) -> tuple[Tensor, ...]:
+    """Rows (C,) of packets and of primitives whose hull may reach into their pyramid; by packet, then by distance."""
     sides = pyramids(rays)
     # Cull first by sixteenths of all packets together, then by packet.
     groups = torch.arange(len(sides)) * 16 // max(1, len(sides))
@@ -109,8 +103,7 @@ def find_candidates(local: LocalScene, rays: Tensor) -> Candidates:
         coarse = pyramids(rays[rows].permute(1, 0, 2).reshape(1, 3, -1))
         some = _inside(coarse, local.corners)[0].nonzero()[:, 0]
         seen[rows[:, None], some[None]] = _inside(sides[rows], local.corners[some])
-    packet, primitive = seen.nonzero(as_tuple=True)
-    return packet, primitive
+    return seen.nonzero(as_tuple=True)
 
 
 def _inside(sides: Tensor, corners: Tensor) -> Tensor:
@@ -120,7 +113,7 @@ def _inside(sides: Tensor, corners: Tensor) -> Tensor:
     return (dots.view(n, 4, p, 8).amax(3) >= 0).all(1)
 
 
-def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
+def cast(local: LocalScene, start: Tensor, rays: Tensor, packet: Tensor, primitive: Tensor) -> tuple[Tensor, Tensor]:
     """Find the first hits of packets of unit rays (n, 3, R) from ``start`` (n or 1, 3), in the street frame.
 
     ``local`` may be several scenes, one after the other, each relative to the origin of other packets. Gives (n, R)
@@ -131,7 +124,6 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     height_m, down = start[:, 2:], -rays[:, 2]
     t = torch.where((down > 1e-7) & (height_m > 0), height_m * down.clamp_min(1e-7).reciprocal(), torch.inf)
     hit = torch.where(torch.isfinite(t), GROUND_ID, SKY_ID)
-    packet, primitive = candidates
     curved = (~local.is_box[primitive]).nonzero()[:, 0]
     ends = torch.bincount(packet, minlength=len(rays)).cumsum(0)
     rest = rays, packet[curved], primitive[curved], ends, primitive, t, hit
@@ -190,8 +182,8 @@ def _to_tiles(a: np.ndarray) -> Tensor:
     """(h, w[, c]) to (tiles, c, 256); the last rows and columns are repeated to fill tiles."""
     h, w = a.shape[:2]
     a = np.pad(a.reshape(h, w, -1), ((0, -h % TILE_PX), (0, -w % TILE_PX), (0, 0)), mode="edge")
-    a = a.reshape(-(-h // TILE_PX), TILE_PX, -(-w // TILE_PX), TILE_PX, -1).transpose(0, 2, 4, 1, 3)
-    return torch.as_tensor(np.ascontiguousarray(a)).view(-1, a.shape[2], TILE_PX**2)
+    tiles = torch.as_tensor(a).unfold(0, TILE_PX, TILE_PX).unfold(1, TILE_PX, TILE_PX)
+    return tiles.reshape(-1, a.shape[2], TILE_PX**2)
 
 
 def _from_tiles(a: Tensor, size: tuple[int, int]) -> Tensor:
@@ -239,8 +231,7 @@ class Renderer:
         face = faces(tables, hits.point, hits.primitive)
         color = self._shade(tables, hits, face)
         if self.supersampling > 1:
-            key = torch.where(hits.primitive >= 0, hits.primitive * 8 + face, hits.primitive)
-            chosen, hits = self._cast_outlines(first, key, scene)
+            chosen, hits = self._cast_outlines(first, hits.primitive * 8 + face, scene)
             fine = self._shade(tables, hits, faces(tables, hits.point, hits.primitive))
             samples = fine.view(-1, self.supersampling**2, 3).unbind(1)
             color[chosen] = reduce(torch.add, samples) / len(samples)  # a fixed order of summation
@@ -273,11 +264,9 @@ class Renderer:
             first_tile += tiles[k]
         local = LocalScene(*map(torch.cat, zip(*scenes, strict=True)))
         packet, primitive = map(torch.cat, zip(*casts, strict=True))
-        t, hit = cast(local, start, directions, (packet, primitive))
+        t, hit = cast(local, start, directions, packet, primitive)
         t, hit = torch.where(rays.valid, t, torch.inf), torch.where(rays.valid, hit, SKY_ID)
-        flat = directions.transpose(1, 2).reshape(-1, 3)
-        starts = start.repeat_interleave(TILE_PX**2, 0)
-        hits = _hits(starts, flat, t.reshape(-1), hit.reshape(-1), rays.pitch.reshape(-1))
+        hits = _hits(start, directions, t, hit, rays.pitch)
         return _Cast(cameras, tiles, rays, start, local, (packet, primitive), t, hit, hits)
 
     def _cast_outlines(self, first: _Cast, key: Tensor, scene: Scene) -> tuple[Tensor, Hits]:
@@ -309,22 +298,18 @@ class Renderer:
         rank = torch.arange(len(packet)) - (counts.cumsum(0) - counts)[packet]  # of a candidate in its packet
         at = (found.cumsum(0) - found)[tile[packet]] + rank
         packets = _to_street(sub.transpose(1, 2).contiguous(), scene)
-        t, hit = cast(first.local, first.start[tile], packets, (packet, primitive[at]))
-        t, hit, direction = t.reshape(-1), hit.reshape(-1), packets.transpose(1, 2).reshape(-1, 3)
-        pitch = (rays.pitch[tile, slot] / s).repeat_interleave(s * s)
-        start = first.start[tile].repeat_interleave(s * s, 0)
-        return tile * outline.shape[1] + slot, _hits(start, direction, t, hit, pitch)
+        t, hit = cast(first.local, first.start[tile], packets, packet, primitive[at])
+        pitch = (rays.pitch[tile, slot] / s)[:, None].expand_as(t)
+        return tile * outline.shape[1] + slot, _hits(first.start[tile], packets, t, hit, pitch)
 
     def _views(self, tables: SceneTables, first: _Cast, color: Tensor) -> list[tuple[Tensor, ...]]:
         hit, rays = first.hit, first.rays
-        depth = first.t * _dot(rays.axis, rays.directions)
+        depth = first.t * dot(rays.axis[..., None], rays.directions)
         depth = torch.where(torch.isfinite(first.t), depth, torch.inf)
-        row = hit.clamp_min(0)
-        classes = tables.cls[row]
-        surroundings = (hit == GROUND_ID, SceneClass.GROUND), (hit == SKY_ID, SceneClass.SKY)
-        for there, cls in (*surroundings, (~rays.valid, SceneClass.VOID)):
-            classes = torch.where(there, int(cls), classes)
-        instances = torch.where(hit >= 0, tables.instance[row], -1)
+        # GROUND_ID and SKY_ID are the last two rows.
+        classes = torch.cat([tables.cls, torch.tensor([SceneClass.GROUND, SceneClass.SKY])])[hit]
+        classes = torch.where(rays.valid, classes, int(SceneClass.VOID))
+        instances = F.pad(tables.instance, (0, 2), value=-1)[hit]
         image = (color.view(*hit.shape, 3) * 255 + 0.5).to(torch.uint8) * rays.valid[..., None]
         maps = image, depth, classes.to(torch.uint8), instances.to(torch.int16)
         views = []
@@ -342,7 +327,7 @@ class _Cast(NamedTuple):
     rays: CameraRays
     start: Tensor  # [n, 3] the camera's centre, street frame
     local: LocalScene
-    candidates: Candidates
+    candidates: tuple[Tensor, ...]
     t: Tensor
     hit: Tensor
     hits: Hits  # flat
@@ -355,6 +340,8 @@ def _to_street(rays: Tensor, scene: Scene) -> Tensor:
     return torch.stack([c * x - s * y, s * x + c * y, z], 1)
 
 
-def _hits(start: Tensor, direction: Tensor, t: Tensor, hit: Tensor, pitch: Tensor) -> Hits:
-    reach = torch.where(torch.isfinite(t), t, 0.0)
-    return Hits(start + direction * reach[:, None], direction, reach, pitch, hit)
+def _hits(start: Tensor, rays: Tensor, t: Tensor, hit: Tensor, pitch: Tensor) -> Hits:
+    """Flat hits of packets of rays (n, 3, R) from ``start`` (n, 3)."""
+    direction, reach = rays.transpose(1, 2).reshape(-1, 3), torch.where(torch.isfinite(t), t, 0.0).reshape(-1)
+    point = start.repeat_interleave(rays.shape[2], 0) + direction * reach[:, None]
+    return Hits(point, direction, reach, pitch.reshape(-1), hit.reshape(-1))

@@ -187,8 +187,8 @@ class Placed:
     instance: int
 
     def box(self, x: Range, y: Range, z: Range, look: Look, *, taper: Param = _ZEROS) -> None:
-        """Add a box from its bounds; ``taper``: how far front, rear, left and right lean inward at the top, metres."""
-        lo, hi = np.array([x, y, z], np.float64).T
+        """Add a box from bounds in any order; front, rear, left and right lean in by ``taper`` metres at the top."""
+        lo, hi = np.sort([x, y, z]).T
         hx, hy, hz = half = (hi - lo) / 2
         front, rear, left, right = taper
         ends, sides = [[2 * hz, 0, front], [-2 * hz, 0, rear]], [[0, 2 * hz, left], [0, -2 * hz, right]]
@@ -200,7 +200,7 @@ class Placed:
         corners[:, 0] -= np.where(top, np.where(corners[:, 0] > 0, front, -rear), 0)
         corners[:, 1] -= np.where(top, np.where(corners[:, 1] > 0, left, -right), 0)
         planes = np.column_stack([normals, offsets]) / norm[:, None]
-        self._add(BOX, (hi + lo) / 2, half, look, corners=corners, planes=planes)
+        self._add(BOX, (hi + lo) / 2, half, look, hull=(corners, planes))
 
     def ellipsoid(self, center: Vector, radii: Vector, look: Look) -> None:
         """Add an ellipsoid along the object's axes."""
@@ -211,13 +211,12 @@ class Placed:
         axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) if lateral else _NO_TURN
         self._add(CYLINDER, center, (*radii, half_length), look, axes)
 
-    def _add(
-        self, kind: int, middle: Any, half: Any, look: Look, axes: Any = _NO_TURN, corners: Any = None, planes: Any = 0
-    ) -> None:
-        half, planes = np.array(half), planes + np.zeros((6, 4))
+    def _add(self, kind: int, middle: Any, half: Any, look: Look, axes: Any = _NO_TURN, hull: Any = None) -> None:
+        half = np.array(half)
+        corners, planes = hull or (_SIGNS * half, np.zeros((6, 4)))
         rotation, center = self.rotation @ axes, self.origin + self.rotation @ middle
         normals = planes[:, :3] @ rotation.T
         row = {"kind": kind, "center": center, "rotation": rotation, "half": half, **look._asdict()}
         row["planes"] = np.column_stack([normals, planes[:, 3] + normals @ center])
-        row["corners"] = center + (_SIGNS * half if corners is None else corners) @ rotation.T
+        row["corners"] = center + corners @ rotation.T
         self.builder.primitives.append({**row, "cls": self.cls, "instance": self.instance})

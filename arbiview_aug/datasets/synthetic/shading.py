@@ -7,15 +7,12 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from arbiview_aug.datasets.synthetic.materials import MATERIALS, Surface, dot, mix, octave, step
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, GROUND_ID, BoxClass, Material, Scene, SceneClass
-
-FloatGrid = npt.NDArray[np.float32]
 
 CHUNK = 32768  # hits shaded at a time: each temporary stays in the cache
 _HAZE_M = 1100.0  # distance at which half of the light is the air's
@@ -29,7 +26,7 @@ def tables_of(scene: Scene) -> SceneTables:
     """A scene, its arrays as float32 and int64 tensors under their names, its light map; the last ones are kept."""
     arrays = {name: torch.tensor(array) for name, array in vars(scene).items() if isinstance(array, np.ndarray)}
     tensors = {name: a.float() if a.is_floating_point() else a for name, a in arrays.items()}
-    return SceneTables(**tensors, scene=scene, light=torch.as_tensor(light_map(scene)))
+    return SceneTables(**tensors, scene=scene, light=light_map(scene))
 
 
 class Hits(NamedTuple):
@@ -58,16 +55,24 @@ def faces(tables: SceneTables, point: Tensor, primitive: Tensor) -> Tensor:
 def lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor:
     """(n, 3) colours of hits on box sides ``face`` (n,) of one material, in the light, behind haze."""
     light, row = tables.scene.light, hits.primitive.clamp_min(0)  # the road has the first primitive's row, unused
-    half, rotation, center = (a.index_select(0, row) for a in (tables.half, tables.rotation, tables.center))
-    offset = hits.point - center
-    local = offset[:, 0:1] * rotation[:, 0] + offset[:, 1:2] * rotation[:, 1] + offset[:, 2:3] * rotation[:, 2]
+    selected = tables.half, tables.rotation, tables.center, tables.color, tables.param
+    half, rotation, center, color, param = (table.index_select(0, row) for table in selected)
+    local = dot((hits.point - center)[..., None], rotation)
     if material == GROUND_ID:
         normal = torch.tensor([0.0, 0.0, 1.0]).expand_as(local)
     else:
-        normal = _normals(tables, row, face, local, half, rotation)
+        kind = tables.kind[row]
+        normal = tables.planes.view(-1, 4).index_select(0, row * 6 + face)[:, :3]
+        if bool((kind != BOX).any()):
+            gradient = local / (half * half)
+            cap = (local[:, 2].abs() > half[:, 2] * (1 - 1e-4) - 1e-5) & (kind == CYLINDER)
+            gradient[:, 2] = torch.where(kind == CYLINDER, 0.0, gradient[:, 2])
+            gradient[:, 2] = torch.where(cap, local[:, 2].sign() * 1e6, gradient[:, 2])
+            gradient = gradient / dot(gradient, gradient).sqrt().clamp_min(1e-9)[:, None]
+            round_normal = dot(gradient[..., None], rotation.transpose(1, 2))
+            normal = torch.where((kind == BOX)[:, None], normal, round_normal)
     across = hits.t * hits.pitch
     slant = across / dot(normal, hits.direction).abs().clamp_min(0.01)
-    color, param = tables.color.index_select(0, row), tables.param.index_select(0, row)
     surface = Surface(
         tables.scene, hits.point, local, half, face, hits.direction, normal, across, slant, color, param, row
     )
@@ -84,19 +89,6 @@ def lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor:
     return mix(color, torch.tensor(light.horizon), hits.t / (hits.t + _HAZE_M))
 
 
-def _normals(tables: SceneTables, k: Tensor, face: Tensor, local: Tensor, half: Tensor, rotation: Tensor) -> Tensor:
-    kind = tables.kind[k]
-    flat = tables.planes.view(-1, 4).index_select(0, k * 6 + face)[:, :3]
-    if bool((kind == BOX).all()):
-        return flat
-    gradient = local / (half * half)
-    cap = (local[:, 2].abs() > half[:, 2] * (1 - 1e-4) - 1e-5) & (kind == CYLINDER)
-    gradient[:, 2] = torch.where(cap, local[:, 2].sign() * 1e6, torch.where(kind == CYLINDER, 0.0, gradient[:, 2]))
-    gradient = gradient / dot(gradient, gradient).sqrt().clamp_min(1e-9)[:, None]
-    x, y, z = (gradient[:, k : k + 1] * rotation[:, :, k] for k in range(3))
-    return torch.where((kind == BOX)[:, None], flat, x + y + z)
-
-
 def sky(scene: Scene, hits: Hits) -> Tensor:
     """(n, 3) sky along the hits' directions: a gradient with clouds on a plane overhead."""
     light, d = scene.light, hits.direction
@@ -109,18 +101,16 @@ def sky(scene: Scene, hits: Hits) -> Tensor:
     n = octave(x, y, 2.2, f, salt) + 0.55 * octave(x, y, 0.9, f, salt + 1) + 0.3 * octave(x, y, 0.4, f, salt + 2)
     n = n + 0.15 * octave(x, y, 0.17, f, salt + 3)
     cover = step(n, -0.1, 0.9) * light.clouds * (up * 8).clamp(0, 1)
-    white = torch.tensor([0.94, 0.945, 0.95])
-    return mix(color, white, cover * 0.9)
+    return mix(color, torch.tensor([0.94, 0.945, 0.95]), cover * 0.9)
 
 
-def light_map(scene: Scene) -> FloatGrid:
+def light_map(scene: Scene) -> Tensor:
     """(2, rows along y, columns along x) float32: share of the sky's and of the sun's light that reaches the ground."""
     xs, ys = (np.arange(a, b, SHADOW_CELL_M, dtype=np.float32) + SHADOW_CELL_M / 2 for a, b in (SHADOW_X_M, SHADOW_Y_M))
-    sky, sun = np.ones((2, len(ys), len(xs)), np.float32)
+    sky, sun = light = np.ones((2, len(ys), len(xs)), np.float32)
 
     def window(lo: np.ndarray, hi: np.ndarray) -> tuple[slice, slice]:
-        a = np.searchsorted(xs, [lo[0], hi[0]]), np.searchsorted(ys, [lo[1], hi[1]])
-        return slice(a[1][0], a[1][1]), slice(a[0][0], a[0][1])
+        return slice(*np.searchsorted(ys, [lo[1], hi[1]])), slice(*np.searchsorted(xs, [lo[0], hi[0]]))
 
     for box, label in zip(scene.boxes, scene.box_classes, strict=True):
         is_vehicle = label < BoxClass.PEDESTRIAN  # people and two-wheelers cover little ground
@@ -144,11 +134,11 @@ def light_map(scene: Scene) -> FloatGrid:
         if rows.start < rows.stop and cols.start < cols.stop:
             dim = 0.75 if scene.cls[k] == SceneClass.VEGETATION else 1.0  # light passes through leaves
             sun[rows, cols] *= 1 - np.float32(dim) * _shaded(scene, int(k), xs[None, cols], ys[rows, None], d)
-    both = F.avg_pool2d(F.pad(torch.from_numpy(np.stack([sky, sun]))[None], (1, 1, 1, 1), mode="replicate"), 3, 1)
-    return both[0].numpy()
+    padded = F.pad(torch.from_numpy(light)[None], (1, 1, 1, 1), mode="replicate")
+    return F.avg_pool2d(padded, 3, 1)[0]
 
 
-def _shaded(scene: Scene, k: int, x: FloatGrid, y: FloatGrid, d: np.ndarray) -> npt.NDArray[np.bool_]:
+def _shaded(scene: Scene, k: int, x: np.ndarray, y: np.ndarray, d: np.ndarray) -> np.ndarray:
     """(rows, columns): rays along ``d`` from the points (x, y, 0) that pass through primitive ``k``."""
     if scene.kind[k] == BOX:
         enter, leave = (np.full((y.shape[0], x.shape[1]), s * np.inf, np.float32) for s in (-1, 1))
@@ -171,10 +161,9 @@ def _shaded(scene: Scene, k: int, x: FloatGrid, y: FloatGrid, d: np.ndarray) -> 
     return np.asarray((enter < leave) & (leave > 0))
 
 
-def sample_light(table: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Sky and sun shares (n,) at ground points (n,) from a light map; the border value outside."""
+def sample_light(table: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """(2, n) sky and sun shares at ground points (n,) from a light map; the border value outside."""
     u = (x - SHADOW_X_M[0]) * (2 / (SHADOW_X_M[1] - SHADOW_X_M[0])) - 1
     v = (y - SHADOW_Y_M[0]) * (2 / (SHADOW_Y_M[1] - SHADOW_Y_M[0])) - 1
-    grid = torch.stack([u.clamp(-1, 1), v.clamp(-1, 1)], -1)[None, None]
-    out = F.grid_sample(table[None], grid, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0]
-    return out[0], out[1]
+    grid = torch.stack([u, v], -1)[None, None]
+    return F.grid_sample(table[None], grid, padding_mode="border", align_corners=False)[0, :, 0]

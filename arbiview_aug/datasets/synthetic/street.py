@@ -9,30 +9,15 @@ import numpy as np
 
 from arbiview_aug.cameras.rotations import yaw_matrix
 from arbiview_aug.datasets.synthetic import objects
-from arbiview_aug.datasets.synthetic.scene import (
-    BoxClass,
-    Light,
-    Look,
-    Material,
-    Range,
-    Scene,
-    SceneBuilder,
-    SceneClass,
-    Street,
-)
+from arbiview_aug.datasets.synthetic.scene import Light, Look, Material, Range, Scene, SceneBuilder, SceneClass, Street
 
 CLEAR_X_M, CLEAR_Y_M = (-3.0, 6.5), 2.2  # of the ego frame without objects: no camera of a sensible rig is inside one
-
 END_M = 260.0
-BLOCK_DEPTH_M = 140.0
 _PARKED_REACH_M = 75.0
 _MOVING_REACH_M = 95.0
-_KINDS = (BoxClass.CAR, BoxClass.VAN, BoxClass.TRUCK, BoxClass.BUS)
-_MOVING_SHARES = (0.62, 0.18, 0.14, 0.06)
+_MOVING_SHARES = (0.62, 0.18, 0.14, 0.06)  # of the kinds of ``objects.VEHICLE_SIZES``
 _PARKED_SHARES = (0.76, 0.19, 0.05, 0.0)
-_SPEED_MPS = (6.0, 14.0)
 _SIGNS = ((0.78, 0.12, 0.12), (0.10, 0.25, 0.62), (0.85, 0.72, 0.10), (0.90, 0.90, 0.90))
-_WAITING = 0.2  # share of the people and of the traffic in other directions that does not move
 
 
 def make_scene(seed: int, index: int) -> Scene:
@@ -49,12 +34,12 @@ def make_scene(seed: int, index: int) -> Scene:
     world.add_pedestrians()
     # Traffic in the vehicle's direction keeps about its speed, so that it stays off the place before and behind it.
     motion = np.random.default_rng(np.random.SeedSequence([seed, index, 2]))
-    speed_mps = motion.uniform(*_SPEED_MPS)
+    speed_mps = motion.uniform(6.0, 14.0)
     velocities = np.zeros((len(world.boxes), 2))
     for row, (box, cls) in enumerate(zip(world.boxes, world.box_classes, strict=True)):
-        walks = cls == BoxClass.PEDESTRIAN
+        walks = cls not in objects.VEHICLE_SIZES
         own_mps = motion.uniform(0.8, 1.7) if walks else speed_mps * motion.uniform(0.9, 1.1)
-        waits = motion.random() < _WAITING and math.cos(box[6]) < 0.5
+        waits = motion.random() < 0.2 and math.cos(box[6]) < 0.5  # some people, some traffic in other directions
         if row >= parked and not waits:
             velocities[row] = own_mps * math.cos(box[6]), own_mps * math.sin(box[6])
     return Scene(
@@ -116,7 +101,10 @@ def _light(rng: np.random.Generator) -> Light:
 
 
 class _World(SceneBuilder):
-    """A scene under construction; all methods draw from one generator, in a fixed order."""
+    """A scene under construction; all methods draw from one generator, in a fixed order.
+
+    A side is -1, right of the road, where traffic heads along x, or 1, left, where it heads against x.
+    """
 
     def __init__(self, rng: np.random.Generator, street: Street, ego2street: np.ndarray) -> None:
         super().__init__(rng)
@@ -126,7 +114,7 @@ class _World(SceneBuilder):
         self.blocks = [(-END_M, END_M)] if math.isinf(x) else [(-END_M, x - half), (x + half, END_M)]
         land = self.place(SceneClass.SIDEWALK)  # kerb, verge, paving, yards
         for side, block in product((-1, 1), self.blocks):
-            y = _span(self.side_y(side, 0), side * BLOCK_DEPTH_M)
+            y = self.side_y(side, 0), side * 140.0
             land.box(block, y, (-0.5, street.kerb_m), Look(Material.SLAB, (0.52, 0.51, 0.49)))
 
     def is_clear(self, x: float, y: float, length: float, width: float, yaw: float) -> bool:
@@ -143,9 +131,9 @@ class _World(SceneBuilder):
 
     def add_vehicle(self, shares: tuple[float, ...], x: float, y: float, yaw: float) -> float:
         """Add a vehicle if there is room; returns its length either way."""
-        cls = BoxClass(int(self.rng.choice(_KINDS, p=shares)))
+        cls, sizes = list(objects.VEHICLE_SIZES.items())[self.rng.choice(len(shares), p=shares)]
         # The height is independent, so that a detector cannot infer it from the footprint.
-        length, width, height = (self.rng.uniform(*bounds) for bounds in objects.VEHICLE_SIZES[cls])
+        length, width, height = (self.rng.uniform(*bounds) for bounds in sizes)
         if self.is_clear(x, y, length, width, yaw):
             objects.add_vehicle(self, cls, (length, width, height), (x, y), yaw)
             self.taken += _discs(x, y, length, width, yaw)
@@ -161,7 +149,8 @@ class _World(SceneBuilder):
 
     def band_y(self, side: int, start: float, end: float) -> Range:
         """y range between two distances behind the kerb."""
-        return _span(self.side_y(side, start), self.side_y(side, end))
+        y = self.side_y(side, start), self.side_y(side, end)
+        return min(y), max(y)
 
     def add_buildings(self) -> None:
         rng, base = self.rng, self.street.kerb_m
@@ -210,7 +199,8 @@ class _World(SceneBuilder):
                 x += width + 0.1
         for direction in (-1, 1):
             if rng.random() < 0.7:
-                xs = _span(direction * rng.uniform(185, 240), direction * 258.0)
+                near = rng.uniform(185, 240)
+                xs = (near, 258.0) if direction > 0 else (-258.0, -near)
                 objects.add_building(self, xs, (-60, 60), (0.0, rng.uniform(14, 45)))
 
     def add_parked(self) -> None:
@@ -221,7 +211,7 @@ class _World(SceneBuilder):
             while x < _PARKED_REACH_M:
                 step, length = self.rng.uniform(0.7, 1.6), 5.0
                 if self.rng.random() < density and not self.at_crossing(x, 9):
-                    yaw = _heading(side) + math.radians(self.rng.normal(0, 1))
+                    yaw = math.pi * (side > 0) + math.radians(self.rng.normal(0, 1))
                     y = self.side_y(side, -1.15 + self.rng.normal(0, 0.06))
                     length = self.add_vehicle(_PARKED_SHARES, x + 2.5, y, yaw)
                 x += (length + 5.0) / 2 + step
@@ -233,7 +223,7 @@ class _World(SceneBuilder):
             x = -_MOVING_REACH_M + self.rng.uniform(0, 20)
             while x < _MOVING_REACH_M:
                 y = side * (lane + 0.5) * street.lane_width_m + self.rng.normal(0, 0.15)
-                yaw = _heading(side) + math.radians(self.rng.normal(0, 1.2))
+                yaw = math.pi * (side > 0) + math.radians(self.rng.normal(0, 1.2))
                 length = 0.0 if self.at_crossing(x, 3) else self.add_vehicle(_MOVING_SHARES, x, y, yaw)
                 x += length + gap * self.rng.uniform(0.6, 1.8) + 3
 
@@ -277,7 +267,7 @@ class _World(SceneBuilder):
             for _ in range(int(rng.integers(2, 6))):
                 x = rng.uniform(-45, 60)
                 if not self.at_crossing(x, 1):
-                    yaw = _heading(side) + rng.normal(0, 0.1)
+                    yaw = math.pi * (side > 0) + rng.normal(0, 0.1)
                     post = self.place(SceneClass.POLE, (x, self.side_y(side, 0.3), base), yaw)
                     height = rng.uniform(2.3, 3.0)
                     post.cylinder((0, 0, height / 2), (0.035, 0.035), height / 2, objects.plain((0.52, 0.53, 0.54)))
@@ -292,7 +282,7 @@ class _World(SceneBuilder):
                     objects.add_bush(self, (x, self.side_y(side, behind), base))
             if not math.isinf(self.street.crossing_x_m):
                 x = self.street.crossing_x_m + side * (self.street.crossing_half_m + 0.5)
-                post = self.place(SceneClass.POLE, (x, self.side_y(side, 0.5), base), _heading(side))
+                post = self.place(SceneClass.POLE, (x, self.side_y(side, 0.5), base), math.pi * (side > 0))
                 post.cylinder((0, 0, 1.7), (0.06, 0.06), 1.7, objects.plain((0.25, 0.26, 0.26)))
                 post.box((-0.28, -0.07), (-0.16, 0.16), (2.5, 3.4), Look(Material.SIGN, objects.DARK, (1.0, 0, 0, 0)))
 
@@ -314,15 +304,6 @@ class _World(SceneBuilder):
                 if self.is_clear(x, y, 0.6, 0.6, 0.0):
                     objects.add_pedestrian(self, (x, y, 0.0), math.pi / 2 * float(rng.choice([-1, 1])))
                     self.taken.append((x, y, 0.35))
-
-
-def _heading(side: int) -> float:
-    """Yaw of traffic on the right (-1) or left (1) side."""
-    return 0.0 if side < 0 else math.pi
-
-
-def _span(a: float, b: float) -> Range:
-    return min(a, b), max(a, b)
 
 
 def _discs(x: float, y: float, length: float, width: float, yaw: float) -> list[tuple[float, float, float]]:
