@@ -109,7 +109,7 @@ SIZES: list[tuple[tuple[int, int], str, str]] = [
     (
         (128, 704),
         "crop",
-        "loses its horizon, 70 rows above the view; choose a size of the images' shape, or 'pad' or 'stretch'",
+        "loses its horizon, 52 rows above the view; choose a size of the images' shape, or 'pad' or 'stretch'",
     ),
 ]
 
