@@ -132,13 +132,19 @@ def _entries(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
     """Entry of each frame, without leading dimensions."""
     count = math.prod(lead)
     if key in _OF_CAMERAS:
-        return split(key, value, lead)
+        try:
+            return split(key, value, lead)
+        except SampleError as error:
+            raise SampleError(f"{error}; rename the key if it is something else") from None
     if key == "lens":
         try:
             names = np.array(value, dtype=object)  # ``default_collate`` makes lists of a batch's names
         except (TypeError, ValueError, RuntimeError):  # tensors that numpy cannot hold
             return [value] * count
-        return names.reshape(-1, count).T.tolist() if lead and names.shape[1:] == lead else [value] * count
+        if not names.ndim or names.shape[1:] != lead[: names.ndim - 1]:
+            return [value] * count
+        names = names.reshape(*names.shape, *[1] * (len(lead) + 1 - names.ndim))  # the frames of a window share theirs
+        return np.broadcast_to(names, (len(names), *lead)).reshape(-1, count).T.tolist()
     if key in _ARRAYS:
         value = numbers(key, value)
     if not lead or (key in _ARRAYS and not value.ndim):

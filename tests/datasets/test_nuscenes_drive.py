@@ -224,6 +224,33 @@ def test_a_camera_that_lost_images(tmp_path: Path) -> None:
         RigRetarget(sample["rig"].turned(pitch_deg=-12))(sample)
 
 
+@pytest.mark.parametrize("jump_us", [10_000_000, 1_030_000])
+def test_nothing_is_a_neighbour_across_a_clock_that_goes_back(tmp_path: Path, jump_us: int) -> None:
+    """From the keyframe at 1.0 s on, times are earlier than those before, or among them."""
+
+    def change(data: Tables) -> None:
+        data["sample"][1:5] = data["sample"][4:0:-1]  # in any order
+        for row in data["sample"]:
+            scene, _, k = row["token"].rpartition("-")
+            row["prev"] = f"{scene}-{int(k) - 1}" if int(k) else ""
+        for row in data["sample_data"]:
+            later = ("goes-sample-3", "goes-sample-4", *["goes-sample-2"] * row["is_key_frame"])
+            row["timestamp"] -= jump_us * (row["sample_token"] in later)
+
+    write(tmp_path, change)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        dataset = NuScenesDataset(tmp_path, neighbours=Neighbours(count=9, step_m=1.2))
+    (back,) = (str(w.message) for w in said)
+    assert "the clock goes back from sample 'goes-sample-1' to 'goes-sample-2': they are no neighbours" in back
+    there = {token: ahead_m(dataset.by_token(token)) for token in dataset.tokens}
+    assert len(there["stops-sample-1"]) == 5  # of a scene whose clock does not
+    for k in range(5):
+        at_m = [0.5 * SPEED_MPS * k + m for m in there[f"goes-sample-{k}"]]
+        assert all((m > 7.5) == (k >= 2) for m in at_m)
+        assert len(at_m) > 2 or jump_us < 5_000_000
+
+
 # --- all of it --------------------------------------------------------------------------------------------------------
 def test_workers_get_the_same(dataset: NuScenesDataset) -> None:
     one, two = (of.by_token("goes-sample-1")["neighbours"] for of in (dataset, pickle.loads(pickle.dumps(dataset))))

@@ -163,6 +163,23 @@ def test_lenses_and_road_of_a_sample_are_those_of_the_source(key: str) -> None:
         read_frames(sample(**other), source)
 
 
+def test_a_key_of_a_batch_that_is_something_else() -> None:
+    batch = sample(images=torch.zeros((3, 2, 3, H, W), dtype=torch.uint8), rig=rig(), coverage=["a"] * 3)
+    with pytest.raises(SampleError, match=r"coverage: expected the images' leading dimensions \(3,\), got str; rename"):
+        read_frames(batch, None)
+
+
+def test_frames_of_a_window_share_their_lenses() -> None:
+    """A sample is a window of frames; ``default_collate`` gives each camera a name over the batch alone."""
+    images = torch.zeros((2, 3, 2, 3, H, W), dtype=torch.uint8)
+    bent = torch.zeros((2, 3, 2, 5))
+    bent[0, :, 0, 0] = -0.1
+    batch = sample(images=images, lens=[("radtan", "pinhole"), ("pinhole", "pinhole")], distortion=bent)
+    batch |= {key: batch[key].expand(2, 3, *batch[key].shape) for key in ("K", "cam2ego")}
+    lenses = [[camera.lens for camera in frame.rig] for frame in read_frames(batch, None)]
+    assert lenses == [["radtan", "pinhole"]] * 3 + [["pinhole", "pinhole"]] * 3
+
+
 def test_calibration_without_the_images_leading_dimensions() -> None:
     images = torch.zeros((3, 2, 3, H, W), dtype=torch.uint8)
     with pytest.raises(SampleError, match=r"K: expected a tensor \(3,\) \+ \(n, ...\), .* got shape \(2, 3, 3\)"):

@@ -142,6 +142,7 @@ class NuScenes(Writer):
             return
         folders.add(folder)
         self._kept(name, where)
+        folder = PurePosixPath(folder).as_posix()  # without "." and "//"
         new = (CONVERSION_FOLDER, self.data.version, *(view_stem("", c.name).rpartition("/")[0] for c in self.target))
         if any(f"{folder}/".startswith(f"{other}/") for other in new):
             raise DataError(f"{where}: expected a file outside of {', '.join(new)}, got one in {folder}")

@@ -29,7 +29,7 @@ from arbiview_aug.datasets.drive import (
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, reduced_rig
 from arbiview_aug.datasets.lidar_files import NUSCENES_COLUMNS, checked_points, read_cloud, row_type
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_annotations, read_recordings
-from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables, is_camera
+from arbiview_aug.datasets.nuscenes.tables import LINKS, TEXTS, TOKENS, Row, Tables, is_camera
 from arbiview_aug.errors import DataError, calibration_of, warn
 
 CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
@@ -132,7 +132,7 @@ class NuScenesDataset(Recording):
             warn(f"nuScenes {self.root}: sample_annotation {lacks}")
         self._sizes: dict[int, tuple[int, int]] = {}  # of sensors whose rows have none
         self._has_lidar_sweeps = False
-        self._drive = None if neighbours is None else self._find_drive()
+        self._drive = None if neighbours is None else self._find_drive(self._parts(tables, samples, np.array(scenes)))
 
     def files(self, index: int) -> list[Path]:
         """Source files of a sample: each camera's image, masks of converted views, and last the LiDAR's points."""
@@ -212,7 +212,21 @@ class NuScenesDataset(Recording):
         points2ego = sensor2ego if own2ego is None else own2ego @ sensor2ego
         return partial(_read_points, self._file(lidar), points2ego, self.lidar_columns)
 
-    def _find_drive(self) -> Drive:
+    def _parts(self, tables: Tables, samples: Sequence[Row], scene: IntArray) -> IntArray:
+        """(S,) part of a drive of each sample: its scene, cut with a warning where ``prev`` leads to a later time."""
+        previous = tables.column("sample", samples, "prev", LINKS, default="")
+        before = np.array([self._index.get(token, -1) for token in previous], np.int64)
+        time_us = self._recordings.rows["time_us"][self._recordings.keyframes[:, -1]]
+        goes_back = (before >= 0) & (scene[before] == scene) & (time_us[before] >= time_us)
+        for k in np.flatnonzero(goes_back)[np.unique(scene[goes_back], return_index=True)[1]].tolist():  # once a scene
+            back = f"the clock goes back from sample {previous[k]!r} to {self.tokens[k]!r}"
+            warn(f"nuScenes {self.root}: {back}: they are no neighbours")
+        order, parts = np.lexsort((time_us, scene)), scene.copy()
+        is_cut = np.isin(scene, scene[goes_back])[order] & (before[order] != np.roll(order, 1))
+        parts[order] = np.cumsum(is_cut | (np.diff(scene[order], prepend=-1) != 0))
+        return parts
+
+    def _find_drive(self, parts: IntArray) -> Drive:
         """Recordings of the first camera that can be neighbours; finds out which sweeps were copied."""
         recordings = self._recordings
         is_key, is_neighbour = recordings.rows["key"], recordings.rows["channel"] == 0
@@ -230,7 +244,9 @@ class NuScenesDataset(Recording):
                 is_neighbour &= is_key
                 break
         rows = np.flatnonzero(is_neighbour)
-        return Drive(rows, recordings.ego2global(rows)[:, :3, 3], recordings.rows["scene"][rows])
+        parts = parts[recordings.rows["sample"][rows]]
+        is_cut = np.diff(parts, prepend=parts[:1]) != 0
+        return Drive(rows, recordings.ego2global(rows)[:, :3, 3], np.cumsum(is_cut))
 
     def _token(self, row: int) -> str:
         """A sample's token, or the name of a sweep's file."""

@@ -118,7 +118,7 @@ def frames(originals: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFix
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
-OWN_FILES = ("conversion/settings.json", "v1.0-mini/sample.json", "samples/ring_front_center/0.jpg")
+OWN_FILES = ("conversion/settings.json", "v1.0-mini/sample.json", "samples//ring_front_center/0.jpg")
 """Names that the conversion itself writes."""
 
 
