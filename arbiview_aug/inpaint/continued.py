@@ -148,7 +148,8 @@ def _line_directions(camera: Camera) -> npt.NDArray[np.float32]:
     """Image directions (2, 2, n, n), x and y, of lines along the heading and of vertical lines, for kernels."""
     if camera.is_rectilinear:
         ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T[..., None, None]  # vanishing points, homogeneous
-        return np.asarray(ends[:, :2] - ends[:, 2:] * np.moveaxis(_places(camera.size, 2), -1, 0), np.float32)
+        directions = ends[:, :2] - ends[:, 2:] * np.moveaxis(_places(camera.size, 2), -1, 0)
+        return np.ascontiguousarray(directions, np.float32)
     rays = camera.unproject_cam(_places(camera.size, _LENS_NODES)).directions
     start = camera.project_cam(rays).uv
     moved = [camera.project_cam(rays + _MOVE * axis).uv - start for axis in camera.cam2ego[:3:2, :3]]
@@ -162,7 +163,7 @@ def _places(size: tuple[int, int], n: int) -> npt.NDArray[np.float64]:
 
 
 def _road_below_horizon(camera: Camera) -> BoolArray:
-    """Nodes ``_STEP_PX`` apart of a view that look down, as in ``ViewPlan.road``."""
+    """Nodes ``_STEP_PX`` apart of a view that look down, as in ``HoleContents.road``."""
     y, x = (np.arange(0, n + _STEP_PX, _STEP_PX, dtype=np.float64) for n in camera.size)
     return camera.unproject(np.stack(np.meshgrid(x, y), -1)).directions[..., 2] < 0
 

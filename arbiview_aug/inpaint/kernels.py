@@ -377,7 +377,7 @@ def fill_background(
         view: (3, h, w) uint8 or float32, filled.
         seen: (h, w) bool.
         layers: (h, w) uint8 as in ``HoleContents``.
-        road: Nodes (my, mx) as in ``ViewPlan``, at equal distances from the first to the last row and column.
+        road: Nodes (my, mx) as in ``HoleContents``, at equal distances from the first to the last row and column.
         fields: (F, 2, my, mx) float32 horizontal and vertical direction of F families of lines, on nodes whose
             outermost ones are the view's corners.
         reach: (5, F) float32 distance in cells at which a line weighs as much as the complete value, by kind.

@@ -125,8 +125,9 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
     def _fill(self, group: Any, pixels: Any, left: Any, seeds: Sequence[int]) -> None:
         """Inpaint drawn canvases of one size, and put their pixels where they belong; their holes are left no more."""
         canvases, drawings = zip(*group, strict=True)
-        images, holes = torch.from_numpy(np.stack(drawings)).to(self.device).split((3, 1), 1)
-        outputs = self.run(images, holes[:, 0] > 0, [seeds[canvas[0][0].view] for canvas in canvases])
+        drawing = torch.from_numpy(np.stack(drawings)).to(self.device)
+        images, holes = drawing[:, :3].contiguous(), drawing[:, 3] > 0
+        outputs = self.run(images, holes, [seeds[canvas[0][0].view] for canvas in canvases])
         if not isinstance(outputs, torch.Tensor) or outputs.shape != images.shape:
             got = tuple(getattr(outputs, "shape", ())) or type(outputs).__name__
             raise GeneratorError(f"inpainting: expected images {tuple(images.shape)}, got {got}")
@@ -156,6 +157,7 @@ class PipelineInpainter(NetworkInpainter):
     Raises:
         ImportError: diffusers or transformers are missing.
         GeneratorError: No such pipeline.
+        ValueError: Something else than a pipeline, or impossible settings.
     """
 
     def __init__(
@@ -180,6 +182,9 @@ class PipelineInpainter(NetworkInpainter):
             except (OSError, ValueError, RuntimeError, AttributeError) as error:
                 expected = "expected an inpainting pipeline of diffusers"
                 raise GeneratorError(f"{where}: {expected}: {one_line(error)}") from None
+        if not hasattr(pipeline, "components"):
+            got = type(pipeline).__name__
+            raise ValueError(f"pipeline: expected one of diffusers, its folder or hub id, got {got}")
         parts = {name: part for name, part in pipeline.components.items() if isinstance(part, torch.nn.Module)}
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer

@@ -246,12 +246,14 @@ def _quantile(samples: Any, first: int, end: int, share: float, bright: float, v
 
     ``bright`` is the quantile of their largest channels from which on they count; ``values`` (n,) is scratch.
     """
+    if end == first:
+        return False
     one, two, three, least = samples[0], samples[1], samples[2], _ZERO
     if bright > 0:  # saturated paint has little luminance
         for k in range(first, end):
             values[k - first] = max(one[k], two[k], three[k])
         least = _select(values, end - first, bright)
-    for c in range(3 if end > first else 0):
+    for c in range(3):
         n, channel = 0, samples[c]
         for k in range(first, end):
             if bright <= 0 or max(one[k], two[k], three[k]) >= least:

@@ -163,10 +163,10 @@ def warm_up() -> None:
     pixels, curves = np.ones((2, 1, 3), np.float32), np.ones((1, 1, 2), np.float32)
     log_ratios(pixels, np.array([0, 1]), 0.0, 2.0, np.empty((1, 3)))
     list_runs(np.zeros((1, 1), np.int8), np.zeros((1, 4), np.int32))
-    for planes in (np.zeros((3, 1, 1), np.uint8), np.zeros((3, 1, 1), np.float32)):
+    for planes in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         for image in (planes, planes.transpose(0, 2, 1)):  # channels first, and last
             read_pixels(image, 0, source, at, _ONE, pixels)
-        view = planes.reshape(1, 3)
+        view = np.zeros((1, 3), planes.dtype)
         tone(view, np.zeros((1, 4), np.int32), curves, _ONE, _ZERO)
         tone_pixels(view, number.astype(np.int8), number, curves, _ONE, _ZERO)
         blend(view, number, view, curves[0, 0, :1], _ZERO)

@@ -370,7 +370,8 @@ class RenderPlan:
         changes = np.flatnonzero(np.diff(keys[starts] // (shape[3] * SEAM_ROWS), prepend=-1))
         ends = np.append(changes, len(starts))[1:]
         seams = np.column_stack([views[changes], other[changes], changes, ends]).tolist()
-        shared = SharedPixels(cameras[:, order], at[:, order], np.append(starts, len(keys)))
+        cameras, at = (np.take(part, order, axis=1) for part in (cameras, at))  # contiguous, for kernels
+        shared = SharedPixels(cameras, at, np.append(starts, len(keys)))
         return SeamSamples(shared, better, part, seams)
 
     @property

@@ -86,7 +86,7 @@ def render_opencv(
         second = _read_pixels(atlas, seam.at, target.seam_interpolation)
         # Tone the views, not the sources: these have more pixels, and would have to be copied.
         if curves is not None:
-            tones = curves[number].astype(np.float32)
+            tones = np.ascontiguousarray(curves[number], np.float32)  # another layout would be compiled, too
             tones = tones if tones.ndim == 3 else tones[:, None].repeat(h, 1)
             tone(buffer.reshape(h, -1), target.runs, tones, *scale)
             tone_pixels(second, seam.source, seam.pixel // w, tones, *scale)

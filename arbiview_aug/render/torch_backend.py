@@ -50,7 +50,7 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
 
 def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
     """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; 0 between slots."""
-    atlas = torch.zeros((len(images[0]), 3, *layout.size), device=images[0].device)
+    atlas = torch.zeros((len(images[0]), 3, *layout.size), dtype=torch.float32, device=images[0].device)
     for slot in layout.slots:
         image, (h, w) = images[slot.source], slot.size
         if slot.level:

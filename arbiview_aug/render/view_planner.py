@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import RayCache, look_apart
+from arbiview_aug.cameras.rays import RayCache, edge_distance, look_apart
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.image_ops import level_size, some_of_cells
@@ -441,3 +441,4 @@ def warm_up() -> None:
     for surface in ("ground", "boxes"):
         plan = build_plan(source, target, geometry=surface, config=config, scene=scene)
     read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
+    edge_distance(middle, np.zeros((1, 2)))

@@ -237,7 +237,8 @@ class BoxSurface(Surface):
             from arbiview_aug.scene.shape_kernels import displace
 
             pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
-            displace(rays.planes, rays.parameters, *pose, self.boxes, self.solids, self.displaced, face, q)
+            boxes = np.ascontiguousarray(self.boxes)
+            displace(rays.planes, rays.parameters, *pose, boxes, self.solids, self.displaced, face, q)
         return q, face
 
     @cached_property

@@ -279,9 +279,10 @@ class RigRetarget(torch.nn.Module):
         if types not in self._checked:
             calibrated = sample.get("rig") is not None or self.source is not None
             reads_ego_frame = not GEOMETRIES[self.geometry].is_static or self.keys.frame == "target"
-            findings = misnamed_keys(sample, calibrated, not reads_ego_frame)
-            findings = [key for key in findings if key.where not in (*self.keys.labels, *self.keys.keep)]
-            for finding in chain(findings, *(camera_findings(frame.rig, frame.images) for frame in frames)):
+            for key in misnamed_keys(sample, calibrated, not reads_ego_frame):
+                if key.where not in (*self.keys.labels, *self.keys.keep):
+                    self._warn(f"key {key.where}", str(key))
+            for finding in chain.from_iterable(camera_findings(frame.rig, frame.images) for frame in frames):
                 self._warn(finding.expected, str(finding))  # once for all cameras
             self._checked.add(types)
         labels = check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)

@@ -108,7 +108,9 @@ def warm_up_boxes() -> None:
 
 def warm_up_points() -> None:
     """Compile the kernels of points' images, or load them from numba's cache."""
-    surface: Any = Scene(boxes=_BOXES, points=_WALL).surface("lidar", 0.0).background
+    objects: Any = Scene(boxes=_BOXES, points=_WALL).surface("lidar", 0.0)
+    objects.drawn(_CAMERA, pixel_rays(_CAMERA))
+    surface = objects.background
     surface.image(_CAMERA, pixel_rays(_CAMERA))
     surface.occlusion_map(_CAMERA, pixel_rays(_CAMERA))
     surface.uncertainty(_CAMERA.center_m, np.eye(3), np.ones(3))

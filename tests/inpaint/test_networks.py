@@ -284,6 +284,8 @@ def test_what_is_no_network_is_refused(lama: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(GeneratorError, match="expected an inpainting pipeline of diffusers"):
         PipelineInpainter(tmp_path / "empty")
+    with pytest.raises(ValueError, match="pipeline: expected one of diffusers, its folder or hub id, got Identity"):
+        PipelineInpainter(nn.Identity())
     with pytest.raises(GeneratorError, match="expected a generator's folder"):
         load_inpainter(tmp_path / "empty")
     assert isinstance(load_inpainter(lama), TorchScriptInpainter)
@@ -294,6 +296,21 @@ def test_what_is_no_network_is_refused(lama: Path, tmp_path: Path) -> None:
 class Broken(nn.Module):
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         return image / 0 * 0
+
+
+def test_a_network_gets_contiguous_images(lama: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    filler = TorchScriptInpainter(lama, size=64)
+    run, counts = filler.run, list[int]()
+
+    def run_flat(images: torch.Tensor, holes: torch.Tensor, seeds: Any) -> torch.Tensor:
+        counts.append(len(images))
+        return run(images.view(-1).view(images.shape), holes.view(-1).view(holes.shape), seeds)
+
+    monkeypatch.setattr(filler, "run", run_flat)
+    hole = torch.zeros(64, 64, dtype=torch.bool)
+    hole[20:30, 20:30] = True
+    filler.inpaint([torch.rand(3, 64, 64)] * 2, [hole] * 2, [0, 0])
+    assert counts == [2]
 
 
 @pytest.mark.parametrize("settings", [{"size": "512"}, {"size": 0}, {"size": 36}, {"batch": None}, {"multiple": 0}])

@@ -173,6 +173,19 @@ def test_half_precision_images_keep_float32_positions(dtype: torch.dtype, autoca
     assert rows.max() > 0.5
 
 
+@pytest.mark.parametrize("execution", ["opencv", "torch"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_views_are_the_same_whatever_the_default_dtype(execution: str, dtype: torch.dtype) -> None:
+    rig = load_rig("nuscenes").resized(0.1)
+    plan, images = build_plan(rig, rig.turned(yaw_deg=12)), noise_images(rig)
+    expected = by(execution, plan, images)
+    torch.set_default_dtype(dtype)
+    try:
+        assert differences(expected, by(execution, plan, images)).max() == 0
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 def test_uncovered_pixels_are_black() -> None:
     rig = load_rig("nuscenes").resized(0.2)
     plan = build_plan(rig, rig.turned(pitch_deg=25))

@@ -468,6 +468,15 @@ def test_rendering_names_the_fix(mistake: str, street: Sample) -> None:
             RigRetarget("waymo", size=(32, 64))(wrong)
 
 
+def test_every_misnamed_key_is_said(street: Sample) -> None:
+    wrong = {**street, "gt_boxes": street["boxes_3d"], "boxes3d": street["boxes_3d"]}
+    del wrong["boxes_3d"]
+    with pytest.warns(UserWarning, match="did you mean boxes_3d") as said:
+        RigRetarget(street["rig"])(wrong)
+    messages = " ".join(str(warning.message) for warning in said)
+    assert "gt_boxes: " in messages and "boxes3d: " in messages
+
+
 def test_a_pose_that_is_none_tells_nothing(street: Sample) -> None:
     for pose in (torch.zeros(4, 4), torch.full((4, 4), float("nan")), torch.eye(3)):
         assert check({**street, "ego2world": pose}).findings == check({**street, "ego2world": None}).findings
