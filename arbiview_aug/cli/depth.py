@@ -106,7 +106,7 @@ def _for_network(
     scene = read_scene(frame, "auto")
     measured = [] if scene.points is None else [scene.points[:, :3]]
     if isinstance(maps := scene.further.get("depth_m"), tuple):
-        measured.append(points_of(maps))
+        measured.append(points_of(maps)[0])
     points = np.concatenate(measured).astype(float) if measured and "LiDAR" in wanted else None
     is_there = "motion" in wanted and motion.path(token).is_file()
     from_motion = motion.read(token, sample["rig"]) if is_there else None

@@ -1,15 +1,16 @@
-"""Depth maps of cameras: fusion with points and with each other, and conversion to points."""
+"""Depth maps of cameras: fusion with points and with each other, conversion to points, and occlusion."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays, pixels_of
@@ -41,7 +42,8 @@ ANCHOR_SHARE = 0.25
 
 _UNANCHORED = 0.1  # weight of the map, in points per square of ``ANCHOR_RAD``
 
-_LEAST_Z = 1e-6  # of a ray that has a depth
+GAP_RAD = (SUPPORT_RAD - SHRINK_RAD) / 2
+"""Angle by which a map's occlusion exceeds its pixels: half that of measured points."""
 
 
 class DepthMap(NamedTuple):
@@ -75,13 +77,7 @@ class DepthMap(NamedTuple):
 
     def at(self, camera: Camera) -> Layer:
         """Depth (h, w) at the pixels of a camera that it ``is_of``, by the nearest pixel; 0 outside."""
-        K, resized = self.camera.K, camera.K
-        if self.camera.size == camera.size and np.array_equal(K, resized):
-            return self.depth_m
-        scale = K[[0, 1], [0, 1]] / resized[[0, 1], [0, 1]]
-        to_map = np.column_stack([np.diag(scale), K[:2, 2] - scale * resized[:2, 2]])
-        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        return np.asarray(cv2.warpAffine(self.depth_m, to_map, camera.size[::-1], flags=flags), np.float32)
+        return _warped(self.camera, self.depth_m, camera, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
 
 
 Maps = tuple[DepthMap, ...]
@@ -113,6 +109,9 @@ def halvings(camera: Camera) -> int:
     return min(max(0, round(math.log2(camera.width_px / MOTION_WIDTH_PX))), most)
 
 
+_rays = lru_cache(16)(pixel_rays)
+
+
 # --- fusion -----------------------------------------------------------------------------------------------------------
 def anchored(depth_map: DepthMap, points: Points, others: Sequence[DepthMap] = ()) -> DepthMap:
     """Fuse a camera's depth map with points (P, 3) in the ego frame and with its other maps, keeping its outlines.
@@ -120,43 +119,30 @@ def anchored(depth_map: DepthMap, points: Points, others: Sequence[DepthMap] = (
     The log-ratio of the map's depth to the points' is averaged around each pixel, on cells as wide as the Gaussian's
     sigma. A pixel becomes unknown where the map contradicts most of the points around it.
     """
+    from arbiview_aug.scene.panorama_kernels import compare_maps, compare_points
+
     camera, depth_m = depth_map
     h, w = depth_m.shape
     sigma = min(ANCHOR_RAD * float(camera.K[0, 0]), max(h, w))
     side = max(1, int(sigma))
-    first = np.arange(0, h, side), np.arange(0, w, side)  # rows and columns of cells
-    sums = np.zeros((3, *map(len, first)))
+    sums = np.zeros((-(-h // side), -(-w // side), 3), np.float32)  # logarithms, points that agree, others
     if len(points):
         R, shift = camera.cam2ego[:3, :3].T, -camera.cam2ego[:3, :3].T @ camera.center_m
         rows = np.ascontiguousarray(points.T, np.float32)[:, None]
         u, v = pixels_of(rows, np.ones((1, len(points)), np.float32), R, shift, camera)
         z = R[2].astype(np.float32) @ rows[:, 0] + np.float32(shift[2])
-        inside = (z > 0) & (u[0] >= -0.5) & (u[0] < w - 0.5) & (v[0] >= -0.5) & (v[0] < h - 0.5)
-        x, y = (np.rint(at[0, inside]).astype(int).clip(0, size - 1) for at, size in ((u, w), (v, h)))
-        cell = np.ravel_multi_index((y // side, x // side), sums.shape[1:])
-        for total, part in zip(sums, _compared(depth_m[y, x], z[inside]), strict=True):
-            total += np.bincount(cell, part, total.size).reshape(total.shape)
+        compare_points(u[0], v[0], z, depth_m, side, ANCHOR_SHARE, sums)
     for other in others:
-        compared = _compared(depth_m, other.at(camera))
-        sums += np.add.reduceat(np.add.reduceat(compared, first[0], axis=1), first[1], axis=2)
+        compare_maps(depth_m, other.at(camera), side, ANCHOR_SHARE, sums)
     if not sums.any():
         return depth_map
-    blurred = cv2.GaussianBlur(sums.transpose(1, 2, 0).astype(np.float32), (0, 0), sigma / side)
-    total, agreeing, contradicting = cv2.split(blurred)
+    total, agreeing, contradicting = cv2.split(cv2.GaussianBlur(sums, (0, 0), sigma / side))
     weight = agreeing + np.float32(_UNANCHORED * side**2 / (2 * math.pi * sigma**2))
     factor, doubt = (
         cv2.resize(cells, None, fx=side, fy=side, interpolation=cv2.INTER_LINEAR)[:h, :w]
         for cells in (np.exp(-total / weight), contradicting - agreeing)
     )
     return DepthMap(camera, np.where(doubt > 0, np.float32(0), depth_m * factor))
-
-
-def _compared(depth_m: Layer, other_m: Layer) -> Layer:
-    """Log-ratios (3, ...) of depths to others where they agree up to ``ANCHOR_SHARE``; whether they do; contradict."""
-    is_known, least = (depth_m > 0) & (other_m > 0), np.float32(1 - ANCHOR_SHARE)
-    agrees = is_known & (depth_m > least * other_m) & (least * depth_m < other_m)
-    ratio = np.divide(depth_m, other_m, where=agrees, out=np.ones_like(depth_m))
-    return np.stack([np.log(ratio), agrees, is_known & ~agrees])
 
 
 def anchored_maps(maps: Iterable[DepthMap], before: Iterable[Points | Maps]) -> Maps:
@@ -181,25 +167,72 @@ def joined(maps: Iterable[DepthMap]) -> list[DepthMap]:
     """Join the maps of each camera and size into one, with the nearest depth of each pixel."""
     by_camera: dict[Camera, Layer] = {}
     for camera, depth_m in maps:
-        known = by_camera.setdefault(camera, np.zeros_like(depth_m))
+        known = by_camera.setdefault(camera, np.zeros_like(depth_m))  # a copy: pixels are left out of it
         np.copyto(known, depth_m, where=(depth_m > 0) & ((known == 0) | (depth_m < known)))
     return list(map(DepthMap._make, by_camera.items()))
 
 
-# --- points -----------------------------------------------------------------------------------------------------------
-def points_of(maps: Iterable[DepthMap]) -> Layer:
-    """The maps' points (P, 3) in the ego frame, map after map and row after row."""
-    parts = [np.zeros((3, 0), np.float32)]
+# --- points and occlusion ---------------------------------------------------------------------------------------------
+def points_of(maps: Sequence[DepthMap], before: Points | None = None) -> tuple[Layer, npt.NDArray[np.int32]]:
+    """Append the maps' points to others (Q, 3): (P, 3) in the ego frame, and pixels (P - Q,), numbered across maps.
+
+    Pixels within ``OWN_CAR_M`` become unknown.
+    """
+    from arbiview_aug.scene.panorama_kernels import put_points
+
+    lead, most, first, car = 0 if before is None else len(before), sum(part.depth_m.size for part in maps), 0, OWN_CAR_M
+    points, pixels, count = np.empty((lead + most + 1, 3), np.float32), np.empty(most + 1, np.int32), 0
+    if before is not None:
+        points[:lead] = before
     for camera, depth_m in maps:
-        rays, depth = _rays_to_depth_1(camera), depth_m.reshape(-1)
-        points = rays * depth + camera.center_m.astype(np.float32)[:, None]
-        parts.append(points.compress((depth > 0) & np.isfinite(rays[0]), axis=1))
-    return np.ascontiguousarray(np.concatenate(parts, axis=1).T)
+        rays, pose = _rays(camera), camera.cam2ego.astype(np.float32)
+        places = (*car[0], *car[1]), first, points[lead:], pixels, count
+        count = put_points(rays.planes, rays.parameters, depth_m, pose, *places)
+        first += depth_m.size
+    return points[: lead + count], pixels[:count]
 
 
-@lru_cache(16)  # the cameras of a rig serve every frame
-def _rays_to_depth_1(camera: Camera) -> Layer:
-    """Ego-frame vectors (3, h w) from a camera's centre to where its pixels have depth 1; NaN where they look aside."""
-    rays = pixel_rays(camera).at(*map(np.arange, camera.size)).reshape(3, -1)
-    ahead = np.where(rays[2] > _LEAST_Z, rays[2], np.float32(np.nan))
-    return np.asarray(camera.cam2ego[:3, :3].astype(np.float32) @ (rays / ahead))
+def forget(maps: Sequence[DepthMap], pixels: npt.NDArray[np.int32]) -> None:
+    """Make pixels (n,), numbered as by ``points_of``, unknown."""
+    first = 0
+    for _, depth_m in maps:
+        depth_m.reshape(-1)[pixels[(pixels >= first) & (pixels < first + depth_m.size)] - first] = 0
+        first += depth_m.size
+
+
+def hidden_by(maps: Sequence[DepthMap], camera: Camera) -> Layer | None:
+    """Inverse distances (h, w) along a camera's rays beyond which its maps hide points; 0 where unknown.
+
+    None without known pixels.
+    """
+    from arbiview_aug.scene.panorama_kernels import hidden_distances
+
+    layers = []
+    for depth_map in maps:
+        if not depth_map.is_of(camera) or not depth_map.depth_m.any():
+            continue
+        rays, hidden = _rays(depth_map.camera), np.empty(depth_map.depth_m.shape, np.float32)
+        hidden_distances(rays.planes, rays.parameters, depth_map.depth_m, hidden)
+        side = 2 * round(GAP_RAD * float(depth_map.camera.K[0, 0])) + 1
+        np.copyto(hidden, cv2.dilate(hidden, np.ones((side, side), np.uint8)), where=hidden == 0)
+        layers.append(_warped(depth_map.camera, hidden, camera, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE))
+    return reduce(np.maximum, layers) if layers else None
+
+
+def _warped(camera: Camera, layer: Layer, resized: Camera, interpolation: int, border: int) -> Layer:
+    """A layer of a camera at the size of another one with the same rays; 0 more than a pixel beyond its image."""
+    if camera.size == resized.size and np.array_equal(camera.K, resized.K):
+        return layer
+    scale = camera.K[[0, 1], [0, 1]] / resized.K[[0, 1], [0, 1]]
+    to_camera = np.column_stack([np.diag(scale), camera.K[:2, 2] - scale * resized.K[:2, 2]])
+    sides = np.divide(camera.size, resized.size)[::-1]
+    is_whole = np.allclose(to_camera, np.column_stack([np.diag(sides), (sides - 1) / 2]), rtol=0, atol=1e-9)
+    if is_whole and interpolation == cv2.INTER_LINEAR:  # faster than a warp
+        return np.asarray(cv2.resize(layer, resized.size[::-1], interpolation=interpolation))
+    size, flags = resized.size[::-1], interpolation | cv2.WARP_INVERSE_MAP
+    warped = np.asarray(cv2.warpAffine(layer, to_camera, size, flags=flags, borderMode=border), np.float32)
+    # A halved layer may lack one pixel at the far borders.
+    for lines, at, side in zip((warped.T, warped), to_camera, camera.size[::-1], strict=True):
+        place = at[:2].sum() * np.arange(len(lines)) + at[2]
+        lines[np.abs(place - (side - 1) / 2) > side / 2 + 1] = 0
+    return warped

@@ -1,4 +1,4 @@
-"""Compiled reading of panoramas: rays in their cells, values between cells."""
+"""Compiled reading of panoramas and depth maps: rays in their cells, values between cells, points, what they hide."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.kernels import angle_row
+from arbiview_aug.cameras.kernels import angle_row, rays_row
 from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.environment import called, compiled, inlined
 
-_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
+_ZERO, _HALF, _ONE, _TWO, _THIRD = (np.float32(value) for value in (0, 0.5, 1, 2, 1 / 3))
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 _HALF_PI = np.float32(np.pi / 2)
+_LEAST_Z = np.float32(1e-6)
 _STEEP = np.sin(np.radians(64.0))  # of elevations up to which azimuths are interpolated
 
 
@@ -126,6 +127,29 @@ def _mixed(layer: Any, i: Any, w: Any, s: float, t: float) -> float:
 
 
 @called
+def _read_row(rows: Any, columns: Any, layer: Any, first: Any, down: Any, right: Any, out: Any) -> None:
+    """Bilinear values (n,) of a panorama's layer (h, w) at rows and columns (n,); its border beyond it."""
+    h, w = layer.shape
+    flat = layer.reshape(h * w)
+    _blocks_row(rows, columns, h, w, first, down, right)
+    for x in range(out.shape[0]):
+        out[x] = _mixed(flat, first[x], w, down[x], right[x])
+
+
+@compiled
+def read_layer(rays: Any, window: Any, layer: Any, out: Any) -> int:
+    """Bilinear values (n,) of a panorama's layer (h, w) along ego-frame rays (3, n); its border beyond it.
+
+    Returns how many rays lie between its first and last column.
+    """
+    n, last = out.shape[0], layer.shape[1] - 1
+    first, work = np.empty(n, np.uint32), np.empty((5, n), np.float32)
+    cells_row(rays[0], rays[1], rays[2], window, work[0], work[1], work[2])
+    _read_row(work[1], work[2], layer, first, work[3], work[4], out)
+    return ((work[2] >= 0) & (work[2] <= last)).sum()
+
+
+@called
 def between_nodes(nodes: Any, step: int, out: Any) -> None:
     """Values (n,) between nodes ``step`` apart; the last ones lie on the last pixel."""
     whole = nodes.shape[0] - 2
@@ -190,7 +214,7 @@ def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> No
 @compiled
 def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int, out: Any) -> None:
     """Values (h, w) between those of a panorama's layer every ``apart`` pixels; the rest is as in ``add_residuals``."""
-    (h, w), (height, width), flat = out.shape, layer.shape, layer.reshape(layer.size)
+    h, w = out.shape
     around, work = np.full((3, 2, w + 1), -2, np.float32), np.empty((4, w + 1), np.float32)
     n, first = -(-w // apart) + 1, np.empty(w + 1, np.uint32)
     nodes = np.empty((-(-h // apart) + 1, n), np.float32)
@@ -202,15 +226,117 @@ def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int
         for i in range(n):
             x = min(i * apart, w - 1)
             v[i], u[i] = v[x], u[x]
-        _blocks_row(v[:n], u[:n], height, width, first[:n], down[:n], right[:n])
-        for i in range(n):
-            nodes[j, i] = _mixed(flat, first[i], width, down[i], right[i])
+        _read_row(v[:n], u[:n], layer, first[:n], down[:n], right[:n], nodes[j])
     for y in range(h):
         _between_rows(nodes, apart, y, h, around[2], out[y])
 
 
+# --- depth maps -------------------------------------------------------------------------------------------------------
 @inlined
 def hidden_below(known: Any) -> Any:
     """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
     known = max(known, _ZERO)
     return known / (np.float32(1.1) + np.float32(0.3) * known)
+
+
+@inlined
+def _logarithm(a: Any, b: Any) -> Any:
+    """log(a / b) of two depths that agree, to 1e-4."""
+    t = (a - b) / (a + b)
+    return _TWO * t * (_ONE + _THIRD * t * t)
+
+
+@compiled
+def compare_points(u: Any, v: Any, z: Any, depth: Any, side: int, share: float, sums: Any) -> None:
+    """Compare a depth map (h, w) with points (n,) at columns ``u`` and rows ``v`` and of depth ``z``.
+
+    Each cell of ``sums`` (ny, nx, 3), ``side`` pixels wide, gains the logarithms of map over point, and the numbers of
+    points that the map agrees with up to ``share``, and of those that it contradicts.
+    """
+    h, w = depth.shape
+    least = np.float32(1 - share)
+    for i in range(u.shape[0]):
+        if not (z[i] > _ZERO and -0.5 <= u[i] < w - 0.5 and -0.5 <= v[i] < h - 0.5):
+            continue
+        x, y = int(np.rint(u[i])), int(np.rint(v[i]))
+        x, y = min(max(x, 0), w - 1), min(max(y, 0), h - 1)
+        d, cell = depth[y, x], sums[y // side, x // side]
+        if d > _ZERO:
+            if d > least * z[i] and least * d < z[i]:
+                cell[0] += _logarithm(d, z[i])
+                cell[1] += _ONE
+            else:
+                cell[2] += _ONE
+
+
+@compiled
+def compare_maps(depth: Any, other: Any, side: int, share: float, sums: Any) -> None:
+    """Compare a depth map (h, w) with another one, as ``compare_points`` does with points."""
+    h, w = depth.shape
+    least, work = np.float32(1 - share), np.empty((3, w), np.float32)
+    logarithm, agrees, contradicts = work[0], work[1], work[2]
+    for y in range(h):
+        one, two, cells = depth[y], other[y], sums[y // side]
+        for x in range(w):
+            a, b = one[x], two[x]
+            agrees[x] = _ONE if (b > _ZERO) & (a > least * b) & (least * a < b) else _ZERO
+        for x in range(w):
+            contradicts[x] = _ONE - agrees[x] if (one[x] > _ZERO) & (two[x] > _ZERO) else _ZERO
+        for x in range(w):
+            a, b = one[x], two[x]
+            logarithm[x] = _logarithm(a, b) if agrees[x] > _ZERO else _ZERO
+        for i in range(cells.shape[0]):
+            for x in range(i * side, min(i * side + side, w)):
+                cells[i, 0] += logarithm[x]
+                cells[i, 1] += agrees[x]
+                cells[i, 2] += contradicts[x]
+
+
+@compiled
+def put_points(
+    planes: Any, P: Any, depth: Any, pose: Any, car: Any, first: int, points: Any, pixels: Any, count: int
+) -> int:
+    """Put the points of a depth map (h, w) behind the first ``count``; return how many there are then.
+
+    The map's rays are ``planes`` (3, h, w), or (3, 0, 0) for a pinhole of ``Camera.parameters`` P, its ``pose`` (4, 4)
+    float32 leads to the ego frame, and its first pixel has the number ``first``. Depths of points within ``car``, least
+    and largest x and y, become 0. ``points`` (n, 3) float32 and the numbers of their ``pixels`` (n,) int32 are written.
+    """
+    (h, w), work, is_known = depth.shape, np.empty((4, depth.shape[1]), np.float32), np.empty(depth.shape[1], np.bool_)
+    x0, x1, y0, y1 = np.float32(car[0]), np.float32(car[1]), np.float32(car[2]), np.float32(car[3])
+    a, b, c, far = work[0], work[1], work[2], work[3]
+    for y in range(h):
+        line = depth[y]
+        rays_row(planes, P, y, np.int64(0), a, b, c)
+        for i in range(w):
+            is_known[i] = (line[i] > _ZERO) & (c[i] > _LEAST_Z)
+            far[i] = line[i] / max(c[i], _LEAST_Z)
+        for i in range(w):
+            a[i], b[i], c[i] = far[i] * a[i], far[i] * b[i], line[i]
+        for i in range(w):
+            far[i] = pose[0, 0] * a[i] + pose[0, 1] * b[i] + pose[0, 2] * c[i] + pose[0, 3]
+        for i in range(w):
+            y_m = pose[1, 0] * a[i] + pose[1, 1] * b[i] + pose[1, 2] * c[i] + pose[1, 3]
+            c[i] = pose[2, 0] * a[i] + pose[2, 1] * b[i] + pose[2, 2] * c[i] + pose[2, 3]
+            a[i], b[i] = far[i], y_m
+        for i in range(w):
+            is_car = (x0 < a[i]) & (a[i] < x1) & (y0 < b[i]) & (b[i] < y1)
+            line[i] = _ZERO if is_car & is_known[i] else line[i]
+            is_known[i] &= not is_car
+        for i in range(w):
+            points[count, 0], points[count, 1], points[count, 2] = a[i], b[i], c[i]
+            pixels[count] = first + y * w + i
+            count += is_known[i]  # else written over, or left out
+    return count
+
+
+@compiled
+def hidden_distances(planes: Any, P: Any, depth: Any, out: Any) -> None:
+    """Inverse distances (h, w) along the rays of a depth map below which points are hidden by it; 0 where unknown."""
+    h, w = depth.shape
+    rays, first = np.empty((3, w), np.float32), np.int64(0)
+    for y in range(h):
+        rays_row(planes, P, y, first, rays[0], rays[1], rays[2])
+        rz, line, hidden = rays[2], depth[y], out[y]
+        for x in range(w):
+            hidden[x] = hidden_below(rz[x] / line[x]) if line[x] > _ZERO else _ZERO

@@ -11,6 +11,7 @@ keeps outlines sharp between the cells.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -25,7 +26,7 @@ from arbiview_aug.cameras.rays import PixelRays
 from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
-from arbiview_aug.scene.depth_map import CELL_RAD, OWN_CAR_M, SHRINK_RAD, SUPPORT_RAD
+from arbiview_aug.scene.depth_map import CELL_RAD, OWN_CAR_M, SHRINK_RAD, SUPPORT_RAD, DepthMap, hidden_by
 from arbiview_aug.scene.surface import Layer, Points, StaticSurface, Surface
 
 SEE_THROUGH_RAD = math.radians(2.0)
@@ -58,6 +59,9 @@ _MOST_FEATURES = 16  # of a point: 3 or 4 longer rows are a transposed array of 
 
 MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
+
+KNOWN_SHARE = 0.9
+"""Share of a camera's pixels with a depth above which its map alone decides occlusion."""
 
 
 class Cells(NamedTuple):
@@ -202,11 +206,17 @@ class PointCloudSurface(Surface):
     points: Points  # (P, 3) in the ego frame, finite, metres; none on the own car
     mapped: int = 0  # number of trailing points from depth maps
     swept: bool = False  # whether points of neighbouring frames are among them
+    maps: Sequence[DepthMap] = ()  # these depth maps, for occlusion in their cameras
     _panoramas: dict[bytes, dict[Window, Panorama]] = field(default_factory=dict, repr=False)
     _nodes: dict[tuple[bytes, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", np.ascontiguousarray(self.points, np.float32))
+
+    @cached_property
+    def _measured(self) -> PointCloudSurface:
+        """The surface without points from maps."""
+        return PointCloudSurface(self.street, self.points[: len(self.points) - self.mapped], swept=self.swept)
 
     @cached_property
     def _rows(self) -> Layer:
@@ -233,10 +243,16 @@ class PointCloudSurface(Surface):
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
 
         Hidden is what is farther than the measured surface by a tenth of its distance and 0.3 m, as in evaluation, and
-        nothing where nothing was measured.
+        nothing where nothing was measured. With ``coarse`` a camera's depth map decides, if it has one, and measured
+        points where it has too few pixels.
         """
         from arbiview_aug.scene.panorama_kernels import interpolate_layer
 
+        known = hidden_by(self.maps, camera) if coarse and self.maps else None
+        if known is not None:
+            if len(self._measured.points) and np.count_nonzero(known) < KNOWN_SHARE * known.size:
+                np.copyto(known, self._measured.hidden(camera, rays, memory), where=known == 0)
+            return known
         measured = coarse and not self.swept and not self.mapped
         cells = COARSE if measured else self._cells(None if coarse else camera)
         panorama, *nodes = self._locate_nodes(camera, rays, cells, memory)
@@ -248,21 +264,18 @@ class PointCloudSurface(Surface):
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) in 1/m: small near points, the street's elsewhere."""
-        from arbiview_aug.scene.panorama_kernels import cells_of
+        from arbiview_aug.scene.panorama_kernels import read_layer
 
-        key, rays = origin.tobytes(), directions.reshape(1, -1, 3).transpose(2, 0, 1).astype(np.float32, order="C")
+        key, rays = origin.tobytes(), directions.reshape(-1, 3).T.astype(np.float32, order="C")
         if not self._panoramas.get(key):
-            self.panorama(origin, rays, np.eye(3), self._cells())
+            self.panorama(origin, rays[:, None], np.eye(3), self._cells())
         readings = []
         for window, panorama in self._panoramas[key].items():
-            rows, columns = np.empty((2, *rays.shape[1:]), np.float32)
-            cells_of(rays, np.eye(3, dtype=np.float32), window, rows, columns)
-            (h, w), row, column = window.shape, np.rint(rows).astype(int), np.rint(columns).astype(int)
-            near = panorama.layers[3][np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
-            readings.append((np.count_nonzero((columns >= 0) & (columns < w)), -window.columns, near))
+            near = np.empty(rays.shape[1], np.float32)
+            readings.append((read_layer(rays, window, panorama.layers[3], near), -window.columns, near))
         near = max(readings, key=lambda reading: reading[:2])[2]  # of the narrowest one that shows most of the rays
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
-        return np.where(near.reshape(unknown.shape) > 0, MEASURED_SPREAD * inverse_distance, unknown)
+        return np.where(near.reshape(unknown.shape) > 0.5, MEASURED_SPREAD * inverse_distance, unknown)
 
     def panorama(
         self, origin: FloatArray, rays: Layer, R: FloatArray, cells: Cells, memory: Memory = FRESH

@@ -14,13 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.environment import compiled, inlined
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.scene.completion import elevations, find_visible
 from arbiview_aug.scene.depth_map import SUPPORT_RAD
-from arbiview_aug.scene.panorama_kernels import cells_of
+from arbiview_aug.scene.panorama_kernels import cells_of, cells_row
 from arbiview_aug.scene.point_cloud import FINE, Scratch, Window, own_car
 from arbiview_aug.scene.surface import Layer, Points
 
@@ -123,26 +122,12 @@ def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Layer], ground_z_m: flo
     lengths = ground_z_m - origin[2], SCANNED.rad, SUPPORT_RAD / SCANNED.rad, SIDE_SUPPORT_RAD / SCANNED.rad
     ground, rad, reach, side = np.array(lengths, np.float32)
     for points in scenes:
-        seen = _place_points(points, origin, window)
+        scratch, index = Scratch.of(window), np.full(window.shape, -1, np.int32)
+        n = find_visible(points, 0, origin, window, scratch)
+        seen = index, *place_points(n, window, scratch, index)
         meet_points(*at, rays, *seen, ground, rad, reach, side, q, nearest)
     continue_road(*at, rays, *seen, ground, side, q, nearest)
     return q, nearest
-
-
-def _place_points(points: Layer, origin: FloatArray, window: Window) -> tuple[Numbers, Layer, Numbers]:
-    """``index`` (h, w), ``seeds`` (4, n) and ``numbers`` (n,) of ``meet_points`` for the points (3, P) seen."""
-    scratch, index = Scratch.of(window), np.full(window.shape, -1, np.int32)
-    n = find_visible(points, 0, origin, window, scratch)
-    cells, rays = scratch.cells[:n], scratch.rays[: 3 * n].reshape(3, 1, n)
-    row, column = np.empty((2, 1, n), np.float32)
-    cells_of(rays, np.eye(3, dtype=np.float32), window, row, column)
-    y, x = np.divmod(cells, window.shape[1])
-    index[y, x] = np.arange(n)
-    turns = np.rint((column[0] - x) / window.cells.turn)  # a halo holds some twice
-    (ahead, left, up), near = rays[:, 0], scratch.q.reshape(-1)[cells]
-    level = np.maximum(np.hypot(ahead, left), 1e-6)
-    seeds = np.stack([row[0], column[0] - window.cells.turn * turns, near / level, up / near], dtype=np.float32)
-    return index, seeds, scratch.number.reshape(-1)[cells]
 
 
 def warm_up() -> None:
@@ -155,6 +140,27 @@ def warm_up() -> None:
 
 
 # --- kernels ---------------------------------------------------------------------------------------------------------
+@compiled
+def place_points(n: int, window: Any, scratch: Any, index: Any) -> tuple[Any, Any]:
+    """``seeds`` (4, n) and ``numbers`` (n,) of ``meet_points`` for the n points that ``find_visible`` found.
+
+    The point in each cell is written to ``index`` (h, w) int32, which is -1 elsewhere.
+    """
+    (h, w), cells, rays = index.shape, scratch.cells, scratch.rays[: 3 * n].reshape(3, n)
+    q, number = scratch.q.reshape(h * w), scratch.number.reshape(h * w)
+    at, seeds, numbers = np.empty((3, n), np.float32), np.empty((4, n), np.float32), np.empty(n, np.int32)
+    cells_row(rays[0], rays[1], rays[2], window, at[0], at[1], at[2])
+    turn = np.float32(window.cells.turn)
+    for i in range(n):
+        y, x, near = cells[i] // w, cells[i] % w, q[cells[i]]
+        index[y, x], numbers[i] = i, number[cells[i]]
+        aside = at[2, i] - np.float32(x)  # a halo holds some twice
+        seeds[0, i], seeds[1, i] = at[1, i], at[2, i] - turn * np.rint(aside / turn)
+        seeds[2, i] = near / np.sqrt(max(rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i], np.float32(1e-12)))
+        seeds[3, i] = rays[2, i] / near
+    return seeds, numbers
+
+
 @compiled
 def meet_points(
     rows: Any, columns: Any, rays: Any, index: Any, seeds: Any, numbers: Any, ground: float, rad: float, reach: float,

@@ -15,7 +15,7 @@ from arbiview_aug.cameras.rays import PixelRays
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.image_ops import Memory
 from arbiview_aug.scene.boxes import BoxSurface, solids, solids_among
-from arbiview_aug.scene.depth_map import Maps, joined, points_of
+from arbiview_aug.scene.depth_map import Maps, forget, joined, points_of
 from arbiview_aug.scene.point_cloud import PointCloudSurface, own_car
 from arbiview_aug.scene.surface import (
     CorrectedSurface,
@@ -128,20 +128,22 @@ def _point_cloud(scene: Scene, ground_z_m: float, reads: Sequence[str]) -> Surfa
     has_points = "points" in reads and scene.points is not None
     parts = (scene.points, scene.sweeps, scene.sky) if has_points else (None, None, None)
     clouds = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in parts]
-    points = np.concatenate(clouds, dtype=np.float32)
-    maps = chain.from_iterable(part for name in reads if isinstance(part := scene.parts.get(name), tuple))
-    mapped = points_of(joined(maps))
-    points, mapped = (part.compress(~own_car(part), axis=0) for part in (points, mapped))
-    points = np.concatenate([points, mapped]) if len(mapped) else points
+    points, pixels = np.concatenate(clouds, dtype=np.float32), np.zeros(0, np.int32)
+    points = points.compress(~own_car(points), axis=0)
+    maps = joined(chain.from_iterable(part for name in reads if isinstance(part := scene.parts.get(name), tuple)))
+    if maps:
+        points, pixels = points_of(maps, points)
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
     if len(points) == 0:
         return scene.surface("street" if boxes is None else "boxes", ground_z_m)
     street, swept = _street(scene, ground_z_m), len(clouds[1]) > 0
     if boxes is None:
-        return PointCloudSurface(street, points, len(mapped), swept)
+        return PointCloudSurface(street, points, len(pixels), swept, maps)
     planes, is_own, displaced = solids_among(boxes, points, ground_z_m)
-    others_mapped = int(np.count_nonzero(~is_own[len(points) - len(mapped) :]))
-    others = PointCloudSurface(street, points.compress(~is_own, axis=0), others_mapped, swept)
+    is_own_pixel = is_own[len(points) - len(pixels) :]
+    forget(maps, pixels[is_own_pixel])
+    mapped = int(np.count_nonzero(~is_own_pixel))
+    others = PointCloudSurface(street, points.compress(~is_own, axis=0), mapped, swept, maps)
     return BoxSurface(others, boxes, planes, displaced)
 
 

@@ -14,7 +14,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.depth_map import DepthMap, anchored, points_of, sparser
+from arbiview_aug.scene.depth_map import GAP_RAD, DepthMap, anchored, hidden_by, points_of, sparser
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
 from arbiview_aug.scene.surface import StaticSurface
 from tests import helpers
@@ -158,7 +158,8 @@ def hilly(camera: Camera, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("camera", [SMALL, FISHEYE], ids=["pinhole", "fisheye"])
 def test_points_are_those_of_single_pixels(camera: Camera) -> None:
     maps = [DepthMap(camera, hilly(camera)), DepthMap(camera.turned(yaw_deg=90), hilly(camera, 1))]
-    points = points_of(maps)
+    points, pixels = points_of(maps, np.ones((3, 3)))
+    assert (points[:3] == 1).all() and len(points) == 3 + len(pixels) == 3 + len(np.unique(pixels))
     every = []
     for view, depth in maps:
         rays, valid = view.unproject_cam(view.pixel_grid())
@@ -166,14 +167,15 @@ def test_points_are_those_of_single_pixels(camera: Camera) -> None:
         local = rays * (depth / np.where(known, rays[..., 2], 1))[..., None]
         every.append(np.where(known[..., None], local @ view.cam2ego[:3, :3].T + view.center_m, np.nan))
     expected = np.concatenate([of.reshape(-1, 3) for of in every])
-    np.testing.assert_allclose(points, expected[np.isfinite(expected[:, 0])], atol=2e-4)
+    assert set(pixels) == set(np.flatnonzero(np.isfinite(expected[:, 0])))
+    np.testing.assert_allclose(points[3:], expected[pixels], atol=2e-4)
 
 
 def test_maps_are_checked_and_as_fine_as_a_panorama() -> None:
     depth = np.full((192, 320), 10.0)
     depth[:20], depth[20:40], depth[40:60], depth[60] = 0.0, np.nan, np.inf, 1e300
     view = helpers.camera(size=(192, 320), position_m=EYE, horizontal_fov_deg=70.0)
-    points = points_of([DepthMap.of(view, depth)])
+    points, _ = points_of([DepthMap.of(view, depth)])
     assert np.allclose(points[:, 0], EYE[0] + 10) and len(points) == 320 * 131
     with pytest.raises(SampleError, match=r"depth_m: camera 'front': expected a map of \(192, 320\), got \(3, 4\)"):
         DepthMap.of(view, np.zeros((3, 4)))
@@ -186,3 +188,43 @@ def test_maps_are_checked_and_as_fine_as_a_panorama() -> None:
     assert np.array_equal(coarse.depth_m > 0, mask[::3, ::3])
     every = sparser(large, 3)
     np.testing.assert_allclose(every.unproject([5, 7.0]).directions, large.unproject([15, 21.0]).directions, atol=1e-9)
+
+
+@pytest.mark.parametrize("camera", [SMALL, FISHEYE], ids=["pinhole", "fisheye"])
+def test_a_map_hides_what_is_clearly_behind_it(camera: Camera) -> None:
+    one = DepthMap(camera, hilly(camera))
+    one.depth_m[30:40, 30:40] = 0
+    hidden = hidden_by([one], camera)
+    rays, _ = camera.unproject_cam(camera.pixel_grid())
+    with np.errstate(divide="ignore"):
+        distance = one.depth_m / rays[..., 2]
+        expected = np.where(distance > 0, 1 / (1.1 * distance + 0.3), 0)
+    assert hidden is not None
+    np.testing.assert_allclose(hidden[distance > 0], expected[distance > 0], rtol=1e-4)
+    assert (hidden[31:39, 31:39] == 0).all()  # closed up to ``GAP_RAD``, less than a pixel
+    h, w = camera.size
+    flat = DepthMap(camera, np.full(camera.size, 20.0, np.float32))
+    larger = hidden_by([flat], camera.resize((2 * h, 2 * w)))
+    assert larger is not None and larger.shape == (2 * h, 2 * w)
+    np.testing.assert_allclose(larger[::2, ::2], hidden_by([flat], camera), rtol=0.02, atol=2e-3)
+    assert hidden_by([one], camera.shifted(z_m=0.1)) is None
+    assert hidden_by([flat._replace(depth_m=np.zeros_like(flat.depth_m))], camera) is None
+
+
+@pytest.mark.parametrize("rows", [50, 51])
+def test_a_map_hides_nothing_outside_its_image(rows: int) -> None:
+    """A narrower camera at the same place knows nothing beyond a pixel; halving leaves out an odd row."""
+    narrow = SMALL.crop(8, 10, (rows, 60))
+    halved = narrow.crop(0, 0, (50, 60)).resize((25, 30))
+    hidden = hidden_by([DepthMap(halved, np.full(halved.size, 10.0, np.float32))], SMALL)
+    assert hidden is not None and (hidden[8 : 8 + min(rows, 40), 10:70] > 0).all()
+    assert not hidden[:5].any() and not hidden[:, :7].any() and not hidden[:, 73:].any()
+
+
+def test_gaps_of_a_map_are_closed_by_what_is_around_them() -> None:
+    view = helpers.camera(size=(192, 320), position_m=EYE, horizontal_fov_deg=40.0)
+    one = DepthMap(view, np.full(view.size, 20.0, np.float32))
+    one.depth_m[:, 100], one.depth_m[:, 200:220] = 0, 0
+    hidden = hidden_by([one], view)
+    assert GAP_RAD * view.K[0, 0] > 1
+    assert hidden is not None and (hidden[:, 95:105] > 0).all() and (hidden[:, 205:215] == 0).all()
