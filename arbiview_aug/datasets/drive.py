@@ -93,9 +93,13 @@ def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, wh
     """(F,) parts of a drive with frames ``names``; a new one begins, with a warning, where the clock goes back."""
     goes_back = [times_s is not None and times_s[after] <= times_s[before] for before, after in pairwise(names)]
     for k in np.flatnonzero(goes_back).tolist():
-        back = f"the clock goes back from frame {names[k]!r} to {names[k + 1]!r}"
-        warn(f"{where}: {back}: they are no neighbours")
+        warn_of_clock(where, f"frame {names[k]!r}", repr(names[k + 1]))
     return np.cumsum([0, *goes_back], dtype=np.int64)[: len(names)]
+
+
+def warn_of_clock(where: str, before: str, after: str) -> None:
+    """Warn of a clock that goes back from one frame to the next."""
+    warn(f"{where}: the clock goes back from {before} to {after}: they are no neighbours")
 
 
 def camera_fields(rig: Rig, images: Any, token: str) -> dict[str, Any]:

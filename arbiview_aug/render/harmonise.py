@@ -166,6 +166,8 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
 
     ``overlaps`` are ``find_overlaps(rig)``, if known: finding them takes longer than the rest. Declined gains are 1.
     """
+    from arbiview_aug.render.photometry_kernels import tone_pixels
+
     overlaps = find_overlaps(rig) if overlaps is None else overlaps
     none = (1.0,) * len(rig)
     if not overlaps.pairs.size:
@@ -184,10 +186,10 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
     if np.abs(log_gains).max() < _MIN_LOG_GAIN:
         return PhotometricReport(none, False, "the cameras agree already")
     gains, held = np.exp(log_gains), pixels[:, held_out[0] :]
-    curves = tone_curves(gains[overlaps.pairs]).repeat(np.diff(held_out), 1)[..., None]
-    gain, slope = np.moveaxis(curves, 2, 0)  # (2, n, 1)
-    lower, upper = held * gain, held * slope + (1 - slope)
-    toned = np.where(gain > 1, np.minimum(lower, upper), np.maximum(lower, upper))
+    toned, cameras = held.copy(), overlaps.pairs.repeat(np.diff(held_out), 1).astype(np.int8)
+    curves = tone_curves(gains).astype(np.float32)[:, None]
+    for values, source in zip(toned, cameras, strict=True):
+        tone_pixels(values, source, np.zeros(len(values), np.int64), curves, *SHARES)
     before, after = (_overlap_psnr_db(both, held_out) for both in (held, toned))
     reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:

@@ -25,6 +25,7 @@ from arbiview_aug.datasets.drive import (
     camera_fields,
     checked_index,
     is_converted,
+    warn_of_clock,
 )
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, reduced_rig
 from arbiview_aug.datasets.lidar_files import NUSCENES_COLUMNS, checked_points, read_cloud, row_type
@@ -219,8 +220,7 @@ class NuScenesDataset(Recording):
         time_us = self._recordings.rows["time_us"][self._recordings.keyframes[:, -1]]
         goes_back = (before >= 0) & (scene[before] == scene) & (time_us[before] >= time_us)
         for k in np.flatnonzero(goes_back)[np.unique(scene[goes_back], return_index=True)[1]].tolist():  # once a scene
-            back = f"the clock goes back from sample {previous[k]!r} to {self.tokens[k]!r}"
-            warn(f"nuScenes {self.root}: {back}: they are no neighbours")
+            warn_of_clock(f"nuScenes {self.root}", f"sample {previous[k]!r}", repr(self.tokens[k]))
         order, parts = np.lexsort((time_us, scene)), scene.copy()
         is_cut = np.isin(scene, scene[goes_back])[order] & (before[order] != np.roll(order, 1))
         parts[order] = np.cumsum(is_cut | (np.diff(scene[order], prepend=-1) != 0))
